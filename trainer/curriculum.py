@@ -1,0 +1,246 @@
+"""Families of tasks as data: TOML in ``curricula/<family>/`` into frozen dataclasses.
+
+A task says which components its scene has, what the trainee must do, how long, and what is measured
+against which target. A component that is not named is ``None`` and costs nothing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from trainer import config
+from trainer.config import NOT_NEGATIVE, POSITIVE, Bounds, ConfigError, Sourced
+from trainer.data_files import data_folder
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Family:
+    """``curriculum.toml``: what a family of tasks is and in which order a trainee meets them."""
+
+    name: str
+    title: str
+    summary: str
+    tasks: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class VesselSpec:
+    """One clamped end of a vessel: a double-hulled tube (Brown 2001, section 3)."""
+
+    name: str
+    cut_edge_mm: Vector  # centre of the cut plane
+    axis: Vector  # direction from the cut into the end
+    outer_diameter_mm: float = field(metadata=POSITIVE)
+    wall_mm: float = field(metadata=POSITIVE)
+    length_mm: float = field(metadata=POSITIVE)  # free length from the cut to the clamp
+    layers: int = field(metadata={"bounds": Bounds(4, 2000)})
+    around: int = field(metadata={"bounds": Bounds(8, 720)})  # nodes of a hull in one layer, even
+    modulus_kPa: Sourced = field(metadata=POSITIVE)
+    puncture_outer_mN: Sourced = field(metadata=POSITIVE)
+    puncture_inner_mN: Sourced = field(metadata=POSITIVE)
+    tear_mN: Sourced = field(metadata=POSITIVE)  # pull on a hole at which it rips out
+
+    def __post_init__(self) -> None:
+        if self.wall_mm >= 0.5 * self.outer_diameter_mm:
+            raise ValueError("'wall_mm' must be less than half of 'outer_diameter_mm'")
+        if self.around % 2:
+            raise ValueError("'around' must be even, so that the links' diagonals can alternate")
+        if not any(self.axis):
+            raise ValueError("'axis' must not be the zero vector")
+
+
+@dataclass(frozen=True)
+class NeedleSpec:
+    """A circular needle, rigid, at the head of the thread (Brown 2001, section 4)."""
+
+    arc_deg: float = field(metadata={"bounds": Bounds(10.0, 270.0)})  # 135 is a 3/8 circle
+    length_mm: float = field(metadata=POSITIVE)  # along the arc
+    wire_mm: float = field(metadata=POSITIVE)
+    drag_mN: Sourced = field(metadata=NOT_NEGATIVE)  # friction of the wire in one hole
+    skid_deg: Sourced = field(metadata=NOT_NEGATIVE)  # flatter than this the tip glides along a wall
+    held_by: str = ""  # instrument that holds the needle when the exercise begins
+    held_at: float = field(default=2 / 3, metadata={"bounds": Bounds(0.0, 1.0)})  # fraction of the arc from the tip
+
+
+@dataclass(frozen=True)
+class ThreadSpec:
+    """The suture behind the needle: short rigid links (Brown 2001, section 4)."""
+
+    size: str  # USP size
+    length_mm: float = field(metadata=POSITIVE)
+    link_mm: float = field(metadata=POSITIVE)
+    diameter_mm: Sourced = field(metadata=POSITIVE)
+    strength_mN: Sourced = field(metadata=POSITIVE)
+    drag_mN: Sourced = field(metadata=NOT_NEGATIVE)  # friction of the thread in one hole
+
+
+@dataclass(frozen=True)
+class InstrumentSpec:
+    """One instrument and where it waits before the exercise."""
+
+    tool: Literal["left", "right"]
+    kind: Literal["forceps"]
+    home_mm: Vector
+    home_rotation_deg: Vector  # about x, then y, then z of the scene
+    reach_mm: float = field(metadata=POSITIVE)  # how far from the jaws' centre a thing can be to be caught
+    grip_mN: Sourced = field(metadata=POSITIVE)  # the most the fully closed jaws hold against a pull
+    close_at: float = field(default=0.7, metadata={"bounds": Bounds(0.05, 1.0)})  # closure that grasps
+    open_at: float = field(default=0.5, metadata={"bounds": Bounds(0.0, 0.95)})  # closure that lets go
+
+    def __post_init__(self) -> None:
+        if self.open_at >= self.close_at:
+            raise ValueError("'open_at' must be less than 'close_at'")
+
+
+@dataclass(frozen=True)
+class SceneSpec:
+    """The components of the scene, and where the whole of it stands in the world."""
+
+    instrument: tuple[InstrumentSpec, ...]
+    vessel: tuple[VesselSpec, ...] = ()
+    needle: NeedleSpec | None = None
+    thread: ThreadSpec | None = None
+    position_mm: Vector = (0.0, 0.0, 0.0)
+    rotation_deg: Vector = (0.0, 0.0, 0.0)  # about x, then y, then z
+
+    def __post_init__(self) -> None:
+        for kind, names in (
+            ("vessel", [v.name for v in self.vessel]),
+            ("instrument", [i.tool for i in self.instrument]),
+        ):
+            if len(set(names)) != len(names):
+                raise ValueError(f"two entries of '{kind}' share a name")
+        if self.thread is not None and self.needle is None:
+            raise ValueError("a 'thread' needs a 'needle' at its head")
+        if self.needle is not None and self.needle.held_by not in {"", *(i.tool for i in self.instrument)}:
+            raise ValueError(f"'needle.held_by' names no instrument: {self.needle.held_by!r}")
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of the goal; steps are reached in order.
+
+    ``drive``: the needle's tip has gone through both walls of ``vessel`` in ``direction``.
+    ``withdraw``: needle and thread are out of every hole. ``tail``: the thread left before its first hole is
+    at most ``at_most_mm``. ``approximate``: the edges at the stitch are at most ``at_most_mm`` apart.
+    """
+
+    name: str
+    kind: Literal["drive", "withdraw", "tail", "approximate"]
+    vessel: str = ""
+    direction: Literal["in", "out"] = "in"
+    clock_deg: float = 0.0  # the marked place
+    bite_mm: float = field(default=0.0, metadata=NOT_NEGATIVE)
+    at_most_mm: float = field(default=0.0, metadata=NOT_NEGATIVE)
+
+
+@dataclass(frozen=True)
+class Limit:
+    """A force or pressure that should not be exceeded."""
+
+    value: float = field(metadata=POSITIVE)
+    unit: str
+    source: str
+
+
+@dataclass(frozen=True)
+class MetricTarget:
+    """A metric that the task wants, and the band that a supervisor hopes to see."""
+
+    name: str
+    source: str
+    low: float | None = None
+    high: float | None = None
+
+
+@dataclass(frozen=True)
+class Task:
+    """One exercise, as its TOML file states it."""
+
+    name: str
+    title: str
+    summary: str
+    time_limit_s: float = field(metadata=POSITIVE)
+    scene: SceneSpec
+    step: tuple[Step, ...]
+    metric: tuple[MetricTarget, ...]
+    limits: dict[str, Limit] = field(default_factory=dict)
+    tick_hz: float = field(default=100.0, metadata={"bounds": Bounds(20.0, 2000.0)})
+
+    def __post_init__(self) -> None:
+        vessels = {v.name for v in self.scene.vessel}
+        for s in self.step:
+            if s.kind == "drive" and s.vessel not in vessels:
+                raise ValueError(f"step '{s.name}' names no vessel of the scene: {s.vessel!r}")
+        if not self.step:
+            raise ValueError("a task needs at least one 'step'")
+
+
+@dataclass(frozen=True)
+class TaskFile:
+    """A task together with the text it came from; the log stores both."""
+
+    path: str  # family/task, or the path of a file outside the curricula
+    text: str
+    task: Task
+
+    @property
+    def sha256(self) -> str:
+        return hashlib.sha256(self.text.encode()).hexdigest()
+
+
+def parse_task(text: str, name: str) -> Task:
+    """The task in a TOML text. Raises ConfigError."""
+    return config.build(Task, config.parse_toml(text, name), name)
+
+
+def load_task(reference: str) -> TaskFile:
+    """The task ``FAMILY/TASK``, or the one in a ``.toml`` file. Raises ConfigError."""
+    if reference.endswith(".toml"):
+        path = Path(reference)
+    else:
+        family, _, task = reference.partition("/")
+        if not task or family not in family_names() or task not in load_family(family).tasks:
+            known = ", ".join(f"{f}/{t}" for f in family_names() for t in load_family(f).tasks)
+            raise ConfigError(f"unknown task '{reference}'; known: {known}")
+        path = data_folder("curricula") / family / f"{task}.toml"
+    text = config.read_text(path)
+    return TaskFile(path=reference, text=text, task=parse_task(text, str(path)))
+
+
+def family_names() -> list[str]:
+    """Names of the families, sorted."""
+    return sorted(p.parent.name for p in data_folder("curricula").glob("*/curriculum.toml"))
+
+
+def load_family(name: str) -> Family:
+    """The family ``name``. Raises ConfigError."""
+    path = data_folder("curricula") / name / "curriculum.toml"
+    return config.build(Family, config.read_toml(path), str(path))
+
+
+def check(path: Path) -> list[str]:
+    """What is wrong with a task file, a family file or a folder of them; empty when nothing is."""
+    if path.is_dir():
+        files = sorted(path.rglob("*.toml"))
+        return [p for f in files for p in check(f)] if files else [f"{path}: holds no TOML file"]
+    try:
+        table = config.read_toml(path)
+        if path.name == "curriculum.toml":
+            family = config.build(Family, table, str(path))
+            return [
+                f"{path}: task '{t}' has no file {t}.toml"
+                for t in family.tasks
+                if not (path.parent / f"{t}.toml").exists()
+            ]
+        task = config.build(Task, table, str(path))
+    except ConfigError as error:
+        return [str(error)]
+    if task.name != path.stem:
+        return [f"{path}: 'name' must equal the file's name, found '{task.name}'"]
+    return []

@@ -1,0 +1,249 @@
+"""The vocabulary of the log: one frozen dataclass per kind of event.
+
+An event is written once, by the rule that saw it happen, and never changed. ``(tick, seq)`` orders all
+events of a session; ``time_s`` may lie inside the tick (an interpolated crossing). Vectors are tuples of
+three floats in the world frame, mm or unit length. Each class docstring is the documentation of its kind.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Event:
+    """What all kinds share."""
+
+    kind: ClassVar[str] = ""
+    #: False for an event that depends on the machine's clock: a replay does not reproduce it.
+    simulated: ClassVar[bool] = True
+
+    tick: int
+    seq: int  # order within the tick
+    time_s: float  # s from the start of the session
+    tool: str  # instrument, or "" where none takes part
+
+
+@dataclass(frozen=True)
+class Grasp(Event):
+    """The jaws closed on something and hold it."""
+
+    kind = "grasp"
+    target: str  # needle, thread or wall
+    body: str  # vessel, or ""
+    arc_mm: float  # along needle and thread from the needle's tip; 0 for a wall
+    point: Vector
+    force_mN: float  # normal force of the jaws
+
+
+@dataclass(frozen=True)
+class Release(Event):
+    """The jaws opened and let go."""
+
+    kind = "release"
+    target: str
+    body: str
+
+
+@dataclass(frozen=True)
+class Slip(Event):
+    """The load exceeded what the grip can hold, and the held thing slid out of the jaws."""
+
+    kind = "slip"
+    target: str
+    body: str
+    load_mN: float
+    limit_mN: float
+
+
+@dataclass(frozen=True)
+class Drop(Event):
+    """The needle was let go with no instrument and no tissue holding it."""
+
+    kind = "drop"
+    target: str
+    point: Vector
+
+
+@dataclass(frozen=True)
+class Contact(Event):
+    """The needle's tip touched a wall of a vessel."""
+
+    kind = "contact"
+    body: str
+    wall: str  # outer or inner
+    direction: str  # in (towards the lumen) or out
+    point: Vector
+    axial_mm: float  # material coordinate: distance from the cut edge
+    clock_deg: float  # material coordinate: clock angle
+
+
+@dataclass(frozen=True)
+class Pierce(Event):
+    """The needle's tip went through a wall; all values are those of the instant of crossing."""
+
+    kind = "pierce"
+    body: str
+    wall: str  # outer or inner
+    direction: str  # in (towards the lumen) or out
+    pass_number: int  # counts the needle's passes through this session's walls, from 1
+    hole: int  # number of the hole, from 0
+    point: Vector
+    axial_mm: float  # material coordinate: distance from the cut edge
+    clock_deg: float  # material coordinate: clock angle
+    tangent: Vector  # the needle's direction at its tip
+    normal: Vector  # outward normal of the undented wall
+    entry_angle_deg: float  # angle of tangent to the wall's tangent plane, 0..90
+    force_mN: float  # force on the tip along its tangent
+    depth_mm: float  # depth of the tip below the undented outer surface, along the normal
+
+
+@dataclass(frozen=True)
+class Withdraw(Event):
+    """Needle or thread left a hole: the tip backwards out of it, or the end of the thread through it."""
+
+    kind = "withdraw"
+    body: str
+    wall: str
+    hole: int
+    pass_number: int
+    end: str  # tip or tail
+    reached_mm: float  # the pass's greatest depth below the undented outer surface
+
+
+@dataclass(frozen=True)
+class PullThrough(Event):
+    """The needle's rear end passed through a hole, which holds thread from now on."""
+
+    kind = "pull_through"
+    body: str
+    wall: str
+    hole: int
+    pass_number: int
+    reached_mm: float  # the pass's greatest depth below the undented outer surface
+
+
+@dataclass(frozen=True)
+class Break(Event):
+    """The thread's tension exceeded its strength."""
+
+    kind = "break"
+    arc_mm: float  # where, along needle and thread from the needle's tip
+    tension_mN: float
+    limit_mN: float
+
+
+@dataclass(frozen=True)
+class Tear(Event):
+    """A wall gave way: a hole pulled out, or grasped tissue ripped from the jaws."""
+
+    kind = "tear"
+    body: str
+    wall: str
+    hole: int  # -1 where grasped tissue tore
+    point: Vector
+    force_mN: float
+    limit_mN: float
+
+
+@dataclass(frozen=True)
+class Overforce(Event):
+    """A force or pressure rose above the task's limit (once per excursion, not per tick)."""
+
+    kind = "overforce"
+    body: str
+    quantity: str  # name of the limit in the task's [limits]
+    value: float
+    limit: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class TrackingLost(Event):
+    """The device no longer sees the instrument, which stays where it was last seen."""
+
+    kind = "tracking_lost"
+
+
+@dataclass(frozen=True)
+class TrackingBack(Event):
+    """The device sees the instrument again."""
+
+    kind = "tracking_back"
+    lost_s: float
+
+
+@dataclass(frozen=True)
+class TickOverrun(Event):
+    """A tick took longer than its time slot."""
+
+    kind = "tick_overrun"
+    simulated = False
+    work_ms: float
+    slot_ms: float
+
+
+@dataclass(frozen=True)
+class TaskStarted(Event):
+    """The first tick of the exercise."""
+
+    kind = "task_started"
+    task: str
+
+
+@dataclass(frozen=True)
+class StepDone(Event):
+    """A step of the task's goal was reached."""
+
+    kind = "step_done"
+    step: str
+    index: int  # from 0
+
+
+@dataclass(frozen=True)
+class TaskDone(Event):
+    """The exercise ended; the fields tell where everything is."""
+
+    kind = "task_done"
+    outcome: str  # completed, failed, aborted or timeout
+    reason: str
+    needle_tip: Vector
+    needle_tangent: Vector  # at the tip
+    thread_end: Vector
+    thread_length_error: float  # largest relative error of a link's length
+    tail_mm: float  # thread left before the first hole; 0 without a thread in a hole
+    gap_mm: float  # distance of the two ends' edges at the stitch; 0 without a stitch
+
+
+KINDS: dict[str, type[Event]] = {
+    cls.kind: cls
+    for cls in (
+        Grasp, Release, Slip, Drop, Contact, Pierce, Withdraw, PullThrough, Break, Tear, Overforce,
+        TrackingLost, TrackingBack, TickOverrun, TaskStarted, StepDone, TaskDone,
+    )
+}  # fmt: skip
+
+_SHARED = tuple(f.name for f in dataclasses.fields(Event))
+
+
+def payload(event: Event) -> str:
+    """The fields of one kind as a JSON object, keys in the order of the class; floats round-trip exactly."""
+    values = {k: v for k, v in dataclasses.asdict(event).items() if k not in _SHARED}
+    return json.dumps(values, allow_nan=False)
+
+
+def from_row(tick: int, seq: int, time_s: float, tool: str, kind: str, data: str) -> Event:
+    """The event of a stored row. Raises ValueError for an unknown kind or fields that do not fit it."""
+    cls = KINDS.get(kind)
+    if cls is None:
+        raise ValueError(f"unknown kind of event {kind!r}")
+    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in json.loads(data).items()}
+    try:
+        return cls(tick=tick, seq=seq, time_s=time_s, tool=tool, **values)
+    except TypeError as error:
+        raise ValueError(f"event {kind!r} at tick {tick}: {error}") from None

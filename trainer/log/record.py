@@ -1,0 +1,60 @@
+"""A stored session as plain data: what metrics, reports, exports and replays read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from trainer.events import Event
+from trainer.geometry import Array
+
+
+@dataclass(frozen=True)
+class SessionHeader:
+    """All that is needed to run a session again, and to say who did it when."""
+
+    id: str
+    trainee: str  # name as given; the log keeps names in a table of their own
+    task: str  # family/task or path
+    task_toml: str
+    task_sha256: str
+    device: str  # as given to --device
+    device_toml: str
+    device_sha256: str
+    seed: int
+    tick_hz: float
+    tools: tuple[str, ...]
+    started_at: str  # UTC, ISO 8601
+    versions: dict[str, str]  # trainer, python, numpy, numba, machine
+    recording: str | None  # path of the .rrd
+
+
+@dataclass(frozen=True)
+class SessionRecord:
+    """A session with its events and tool poses, as the log holds them."""
+
+    header: SessionHeader
+    status: str  # running, ended or aborted
+    outcome: str  # completed, failed, aborted or timeout; "" while running
+    ticks: int
+    duration_s: float
+    events: tuple[Event, ...]  # ordered by (tick, seq)
+    first_tick: int
+    position: Array  # (n, k, 3) mm, one row per tick
+    quaternion: Array  # (n, k, 4) wxyz
+    closure: Array  # (n, k)
+    valid: np.ndarray  # (n, k) bool
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One measured value with all that a reader needs to judge it."""
+
+    name: str
+    value: float | None  # None: the session gave nothing to measure
+    unit: str
+    target_low: float | None
+    target_high: float | None
+    source: str  # of the target band
+    version: str  # changes when the definition does

@@ -1,0 +1,77 @@
+"""What a sink is given at every tick. A sink writes it down; it never decides anything.
+
+A sink has ``tick(step)`` for every tick, ``close()`` at the end, and is made for one session.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from trainer.events import Event
+from trainer.geometry import Array
+from trainer.poses import ToolPoses
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A part of the scene that does not change its topology."""
+
+    name: str  # e.g. vessel/A
+    triangles: np.ndarray  # (f, 3) int32
+    rgba: tuple[int, int, int, int]
+
+
+@dataclass(frozen=True)
+class InstrumentPart:
+    """A rigid part of an instrument: a mesh in its own frame."""
+
+    name: str  # e.g. right/upper
+    tool: int
+    vertices: Array  # (v, 3) mm, part frame
+    triangles: np.ndarray  # (f, 3) int32
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What a recording needs to know before the first frame."""
+
+    surfaces: tuple[Surface, ...]
+    parts: tuple[InstrumentPart, ...]
+    needle: Array | None  # (m, 3) mm centre line in the needle's own frame, tip first
+    needle_radius_mm: float
+    thread_radius_mm: float
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A copy of the scene at one tick, safe to hand to another thread."""
+
+    vertices: tuple[Array, ...]  # per surface, (v, 3) mm, world
+    part_position: Array  # (p, 3) mm, world_from_part
+    part_quaternion: Array  # (p, 4) wxyz
+    needle_position: Array | None  # (3,) world_from_needle
+    needle_quaternion: Array | None  # (4,)
+    thread: tuple[Array, ...]  # pieces of the thread, each (n, 3) mm; empty without thread
+    force_mN: float  # largest force between instruments and tissue
+    tension_mN: float  # thread
+
+
+@dataclass(frozen=True)
+class TickRecord:
+    """One tick as the sinks see it."""
+
+    tick: int
+    time_s: float
+    poses: ToolPoses
+    events: tuple[Event, ...]
+    frame: Callable[[], Frame]  # makes the copy only when asked
+
+
+class Sink(Protocol):
+    def tick(self, record: TickRecord) -> None: ...
+
+    def close(self) -> None: ...
