@@ -91,7 +91,7 @@ class Pierce(Event):
     body: str
     wall: str  # outer or inner
     direction: str  # in (towards the lumen) or out
-    pass_number: int  # counts the needle's passes through this session's walls, from 1
+    pass_number: int  # from 1; a new pass begins when the tip pierces while the needle is in no hole
     hole: int  # number of the hole, from 0
     point: Vector
     axial_mm: float  # material coordinate: distance from the cut edge
@@ -113,7 +113,7 @@ class Withdraw(Event):
     hole: int
     pass_number: int
     end: str  # tip or tail
-    reached_mm: float  # the pass's greatest depth below the undented outer surface
+    reached_mm: float  # how far the tip advanced beyond this wall, along its undented normal
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ class PullThrough(Event):
     wall: str
     hole: int
     pass_number: int
-    reached_mm: float  # the pass's greatest depth below the undented outer surface
+    reached_mm: float  # how far the tip advanced beyond this wall, along its undented normal
 
 
 @dataclass(frozen=True)
