@@ -164,7 +164,13 @@ def _check_bounds(value: float, name: str, key: str, bounds: Bounds | None) -> N
 
 
 def _type_name(kind: Any) -> str:
-    names = {float: "a number", int: "a whole number", str: "a text", bool: "true or false", Sourced: "{ value, source }"}
+    names = {
+        float: "a number",
+        int: "a whole number",
+        str: "a text",
+        bool: "true or false",
+        Sourced: "{ value, source }",
+    }
     if kind in names:
         return names[kind]
     origin = typing.get_origin(kind)

@@ -31,9 +31,7 @@ class ToolPoses:
     def pack(self) -> Array:
         """One row of ``9 k`` float64, as the log stores it."""
         valid = np.asarray(self.valid, dtype=np.float64)
-        return np.concatenate(
-            [self.position, self.quaternion, self.closure[:, None], valid[:, None]], axis=1
-        ).ravel()
+        return np.concatenate([self.position, self.quaternion, self.closure[:, None], valid[:, None]], axis=1).ravel()
 
     @staticmethod
     def unpack(row: Array) -> ToolPoses:

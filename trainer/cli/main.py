@@ -1,0 +1,74 @@
+"""``trainer``: one sub-command per noun, and the one place where an error becomes a line.
+
+Nothing heavy is imported here: the commands import what they need when they run.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import typer
+
+
+def main() -> None:
+    """Run the command line; exit code 0 done, 1 failed with a line on stderr, 2 wrong usage."""
+    if sys.argv[1:] == ["--version"]:
+        from trainer import __version__
+
+        print(f"trainer {__version__}")
+        return
+    try:
+        build_app()(prog_name="trainer")
+    except BrokenPipeError:
+        # Who read our output has gone (`trainer sessions list | head -1`); nothing is left to say to them.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+    except KeyboardInterrupt:
+        sys.exit("trainer: interrupted")
+    except Exception as error:
+        if os.environ.get("TRAINER_DEBUG") or not _meant_for_people(error):
+            raise
+        sys.exit(f"trainer: {_one_line(error)}")
+
+
+def keep_kernels() -> None:
+    """Have numba keep compiled kernels in the user's cache, unless NUMBA_CACHE_DIR already says where.
+
+    The folder of an installed package may not be writable. Must run before numba is imported.
+    """
+    if "NUMBA_CACHE_DIR" not in os.environ:
+        from platformdirs import user_cache_path
+
+        os.environ["NUMBA_CACHE_DIR"] = str(user_cache_path("trainer") / "kernels")
+
+
+def build_app() -> typer.Typer:
+    """The command line with all its sub-commands."""
+    import typer
+
+    from trainer.cli import curricula
+
+    app = typer.Typer(
+        help="Training and assessment of surgical skill.",
+        no_args_is_help=True,
+        rich_markup_mode=None,
+        pretty_exceptions_enable=False,
+        add_completion=False,
+    )
+    app.callback()(keep_kernels)
+    app.add_typer(curricula.app, name="curricula")
+    return app
+
+
+def _meant_for_people(error: Exception) -> bool:
+    """Errors that our own code raises on purpose (ConfigError and its like), and the operating system's."""
+    return isinstance(error, OSError) or type(error).__module__.startswith("trainer.")
+
+
+def _one_line(error: Exception) -> str:
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return " ".join(str(error).split())

@@ -1,0 +1,79 @@
+"""The pace of a session: a fixed tick in real time, or as fast as the machine goes.
+
+A clock never tells the simulation what time it is: simulated time is the tick's number divided by the
+rate. A clock only waits for a tick's slot to begin and measures how long the tick's work took.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from array import array
+
+#: Behind by more than this, a session in real time goes on from where it is (the machine slept, say):
+#: running the missed ticks in a burst would move the scene under the trainee's hands. Assumed.
+LARGEST_LAG_S = 0.25
+
+
+class Fast:
+    """Ticks follow each other at once.
+
+    Between ``begin()`` and ``end()`` lies the work of one tick; ``end`` returns its length in ms.
+    """
+
+    realtime = False
+
+    def __init__(self, tick_hz: float) -> None:
+        self.tick_hz = tick_hz
+        self.slot_ms = 1e3 / tick_hz
+        self._begun_ns = 0
+        self._work_ms = array("d")
+
+    def begin(self) -> None:
+        self._begun_ns = time.perf_counter_ns()
+
+    def end(self) -> float:
+        work_ms = (time.perf_counter_ns() - self._begun_ns) * 1e-6
+        self._work_ms.append(work_ms)
+        return work_ms
+
+    def report(self) -> dict[str, float]:
+        """Work per tick: ``overruns`` is the number of ticks that took longer than their slot of 1 / ``tick_hz``."""
+        ordered = sorted(self._work_ms)
+        return {
+            "tick_hz": self.tick_hz,
+            "overruns": sum(ms > self.slot_ms for ms in ordered),
+            "p50_ms": _percentile(ordered, 0.50),
+            "p99_ms": _percentile(ordered, 0.99),
+            "max_ms": ordered[-1] if ordered else 0.0,
+        }
+
+
+class Realtime(Fast):
+    """Tick k begins k / ``tick_hz`` seconds after tick 0; deadlines are absolute, so lateness does not add up.
+
+    It sleeps until the deadline and does not spin: the operating system wakes it within a fraction of a
+    millisecond, which no device or trainee notices, and a spinning core is taken from the sinks' threads.
+    """
+
+    realtime = True
+
+    def __init__(self, tick_hz: float) -> None:
+        super().__init__(tick_hz)
+        self._due_s = 0.0
+
+    def begin(self) -> None:
+        now = time.perf_counter()
+        if not self._work_ms or now - self._due_s > LARGEST_LAG_S:
+            self._due_s = now
+        elif now < self._due_s:
+            time.sleep(self._due_s - now)
+        self._due_s += 1.0 / self.tick_hz
+        super().begin()
+
+
+def _percentile(ordered: list[float], fraction: float) -> float:
+    """The smallest value that at least ``fraction`` of the sorted values do not exceed (nearest rank); 0 of none."""
+    if not ordered:
+        return 0.0
+    return ordered[math.ceil(fraction * len(ordered)) - 1]

@@ -1,0 +1,112 @@
+"""The loop, and nothing else: device → scene → sinks, one tick after the other."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any, Protocol
+
+import numpy as np
+
+from trainer.clock import Fast
+from trainer.drivers.driver import Driver
+from trainer.events import Event, TickOverrun
+from trainer.poses import ToolPoses
+from trainer.sinks.surface import Frame, Sink, TickRecord
+
+
+class Scene(Protocol):
+    """What the loop needs of :class:`trainer.scene.Scene`."""
+
+    home: ToolPoses
+
+    @property
+    def tick(self) -> int: ...
+
+    @property
+    def outcome(self) -> str: ...
+
+    def step(self, poses: ToolPoses) -> tuple[Event, ...]: ...
+
+    def finish(self, outcome: str, reason: str) -> tuple[Event, ...]: ...
+
+    def view(self) -> Any: ...
+
+    def frame(self) -> Frame: ...
+
+
+def run(
+    scene: Scene,
+    driver: Driver,
+    sinks: Sequence[Sink],
+    clock: Fast,
+    interrupted: Callable[[], bool] = lambda: False,
+) -> None:
+    """Run ``scene`` until it has an outcome; every sink gets one record per tick.
+
+    The last record carries the scene's closing events. Where the session ends because the input did or the
+    trainee interrupted it, that record is one of its own after ``scene.tick`` steps, with the poses held.
+    In real time an overrun is logged with the tick after it, when its length is known.
+    """
+    poses = scene.home
+    late_ms = 0.0
+    while not scene.outcome:
+        clock.begin()
+        tick = scene.tick
+        if interrupted():
+            events = scene.finish("aborted", "interrupted")
+        elif (seen := driver.poll(tick, scene.view())) is None:
+            events = scene.finish("failed", "the input ended before the task was done")
+        else:
+            poses = admit(seen, poses)
+            events = scene.step(poses)
+        if late_ms:
+            events = (*events, _overrun(tick, events, late_ms, clock))
+        record = TickRecord(tick, tick / clock.tick_hz, poses, events, scene.frame)
+        for sink in sinks:
+            sink.tick(record)
+        work_ms = clock.end()
+        late_ms = work_ms if clock.realtime and work_ms > clock.slot_ms else 0.0
+
+
+def admit(seen: ToolPoses, held: ToolPoses) -> ToolPoses:
+    """``seen``, where each instrument whose numbers are no pose keeps that of ``held`` and counts as not seen.
+
+    A pose is finite and its quaternion of length 1 within 1e-6, which is what the sinks and the scene rely on.
+    """
+    pose = np.isfinite(seen.position).all(axis=1) & np.isfinite(seen.closure)
+    with np.errstate(invalid="ignore", over="ignore"):
+        pose &= np.abs(np.sum(seen.quaternion**2, axis=1) - 1.0) < 2e-6
+    if pose.all():
+        return seen
+    return ToolPoses(
+        position=np.where(pose[:, None], seen.position, held.position),
+        quaternion=np.where(pose[:, None], seen.quaternion, held.quaternion),
+        closure=np.where(pose, seen.closure, held.closure),
+        valid=seen.valid & pose,
+    )
+
+
+def _overrun(tick: int, events: tuple[Event, ...], work_ms: float, clock: Fast) -> TickOverrun:
+    """The last event of ``tick``: the work of the tick before it took ``work_ms``."""
+    seq = events[-1].seq + 1 if events else 0
+    return TickOverrun(tick, seq, tick / clock.tick_hz, "", work_ms=work_ms, slot_ms=clock.slot_ms)
+
+
+@contextmanager
+def interruptible() -> Iterator[Callable[[], bool]]:
+    """Ctrl-C asks instead of raising, so that a tick is never left half done; a second Ctrl-C raises."""
+    asked = False
+
+    def ask(signum: int, frame: FrameType | None) -> None:
+        nonlocal asked
+        asked = True
+        signal.signal(signal.SIGINT, before)
+
+    before = signal.signal(signal.SIGINT, ask)
+    try:
+        yield lambda: asked
+    finally:
+        signal.signal(signal.SIGINT, before)
