@@ -1,0 +1,75 @@
+"""Devices: what moves the instruments. :func:`open_driver` turns ``--device`` into one."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from trainer import config
+from trainer.config import ConfigError
+from trainer.curriculum import Task
+from trainer.data_files import data_folder
+from trainer.drivers.driver import Driver
+from trainer.poses import ToolPoses
+from trainer.profile import Profile, ProfileFile, load_profile, parse_profile
+
+__all__ = ["Driver", "is_recording", "open_driver", "open_profile", "recording_path"]
+
+
+def is_recording(reference: str) -> bool:
+    """Whether ``reference`` names a recording (``*.mha``, ``PATH.db#SESSION``) and not a profile."""
+    return reference.endswith(".mha") or _is_logged(reference)
+
+
+def open_profile(reference: str) -> ProfileFile:
+    """The profile of a device: its name, its TOML, or a recording's path. Raises ConfigError.
+
+    A recording is played by a shipped profile with its path filled in; the text is that of the filled-in profile.
+    """
+    if not is_recording(reference):
+        return load_profile(reference)
+    name = "logged-session" if _is_logged(reference) else "plus-sequence"
+    template = config.read_text(data_folder("devices") / f"{name}.toml")
+    text = template.replace('path = ""', f"path = {json.dumps(reference, ensure_ascii=False)}", 1)
+    return ProfileFile(path=reference, text=text, profile=parse_profile(text, reference))
+
+
+def recording_path(file: ProfileFile) -> str:
+    """Where the recording of a profile lies; a relative path in a TOML is relative to it. Raises ConfigError."""
+    profile = file.profile
+    if profile.recording is None or not profile.recording.path:
+        raise ConfigError(f"device '{profile.name}' plays a recording: give its path to --device, or 'recording.path'")
+    beside = Path(file.path).parent if file.path.endswith(".toml") else Path()
+    return str(beside / profile.recording.path)
+
+
+def open_driver(reference: str, task: Task, home: ToolPoses, seed: int) -> tuple[ProfileFile, Driver]:
+    """The device ``reference``, ready for a session of ``task``, whose instruments wait at ``home``.
+
+    Raises ConfigError for a profile or recording that cannot be used.
+    """
+    file = open_profile(reference)
+    return file, _driver(file, file.profile, task, home, seed)
+
+
+def _driver(file: ProfileFile, profile: Profile, task: Task, home: ToolPoses, seed: int) -> Driver:
+    if profile.hand is not None and profile.driver == "scripted":
+        from trainer.drivers.scripted import ScriptedHands
+
+        return ScriptedHands(profile.hand, task, home, seed)
+    path = recording_path(file)
+    tools = [instrument.tool for instrument in task.scene.instrument]
+    if _is_logged(path):
+        from trainer.drivers.logged import LoggedSession
+
+        db, _, session = path.rpartition("#")
+        return LoggedSession(Path(db), session, tools, task.tick_hz)
+    from trainer.drivers.recording import Recording
+
+    assert profile.recording is not None
+    return Recording(Path(path), profile.recording, tools, task.tick_hz, home)
+
+
+def _is_logged(reference: str) -> bool:
+    db, separator, session = reference.rpartition("#")
+    return bool(separator and session) and db.endswith(".db")
