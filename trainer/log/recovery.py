@@ -1,0 +1,75 @@
+"""Sessions that were interrupted: closed and sealed when the log is next opened."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from sqlite_utils import Database
+
+from trainer.log.schema import STALE_S, clear_errors, path_of
+from trainer.log.seal import seal
+
+INTERRUPTED = "the program stopped before the exercise ended"
+
+
+@dataclass(frozen=True)
+class Interrupted:
+    """A session that was found without its end."""
+
+    session: str
+    ticks: int
+    duration_s: float
+    recording: str | None
+
+    def __str__(self) -> str:
+        kept = f"session {self.session} was interrupted: its first {self.duration_s:.2f} s are kept, listed as aborted"
+        if self.recording is None or not Path(self.recording).exists():
+            return kept
+        good = Path(self.recording).with_suffix(".repaired.rrd")
+        repair = f"rerun rrd optimize {shlex.quote(self.recording)} -o {shlex.quote(str(good))}"
+        return f"{kept}; its recording lacks its end, repair it with: {repair}"
+
+
+def recover(db: Database) -> list[Interrupted]:
+    """Close and seal the sessions that say they are running while nobody writes them. Raises LogError."""
+    found = []
+    with clear_errors(path_of(db)):
+        query = "select id, pid, heartbeat, recording from sessions where status = 'running' order by id"
+        for row in list(db.query(query)):
+            if _alive(row["pid"]) and time.time() - row["heartbeat"] < STALE_S:
+                continue
+            if abort(db, row["id"], INTERRUPTED, heartbeat=row["heartbeat"]):
+                kept = next(db.query("select ticks, duration_s from sessions where id = ?", [row["id"]]))
+                found.append(Interrupted(row["id"], kept["ticks"], kept["duration_s"], row["recording"]))
+    return found
+
+
+def abort(db: Database, session_id: str, reason: str, heartbeat: float | None = None) -> bool:
+    """Close a running session as aborted and seal it; False where it has gone on or was closed meanwhile."""
+    with db.atomic():
+        closed = db.conn.execute(
+            "update sessions set status = 'aborted', outcome = 'aborted', reason = ? "
+            "where id = ? and status = 'running' and heartbeat = coalesce(?, heartbeat)",
+            [reason, session_id, heartbeat],
+        ).rowcount
+        if closed:
+            seal(db, session_id)
+    return bool(closed)
+
+
+def _alive(pid: int) -> bool:
+    """Whether a process exists. On Windows the question itself would end it, so there the heartbeat decides."""
+    if sys.platform == "win32":
+        return True
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True

@@ -1,0 +1,198 @@
+"""The tables of the log, and how a connection to it is opened.
+
+Who people are (``trainees``) is kept apart from what they did: everything else holds only a number for a
+person, so that a name can be changed or erased without touching a session or its seal. All tables are
+STRICT: SQLite refuses a text where a number belongs.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+
+import platformdirs
+from sqlite_utils import Database, Migrations
+from sqlite_utils.db import Table
+
+#: A session whose writer has been silent for so long is taken for dead (the writer beats every second).
+STALE_S = 30.0
+
+migrations = Migrations("trainer")
+
+
+class LogError(ValueError):
+    """The log cannot be read or written; one line with the path and the reason."""
+
+
+@migrations()
+def m001_first_tables(db: Database) -> None:
+    table(db, "trainees").create({"id": int, "name": str}, pk="id", not_null={"name"}, strict=True)
+    table(db, "trainees").create_index(["name"], unique=True)
+    session = {
+        "id": str, "trainee": int, "task": str, "task_toml": str, "task_sha256": str, "device": str,
+        "device_toml": str, "device_sha256": str, "seed": int, "tick_hz": float, "tools": str, "started_at": str,
+        "versions": str, "recording": str, "status": str, "outcome": str, "reason": str, "ticks": int,
+        "duration_s": float, "pid": int, "heartbeat": float, "realtime": str, "device_summary": str,
+        "previous": str, "previous_hash": str, "hash": str,
+    }  # fmt: skip
+    table(db, "sessions").create(
+        session,
+        pk="id",
+        not_null=set(session) - {"recording", "realtime", "device_summary", "previous", "previous_hash", "hash"},
+        foreign_keys=[("trainee", "trainees", "id"), ("previous", "sessions", "id")],
+        strict=True,
+    )
+    table(db, "sessions").create_index(["trainee", "started_at"])
+    event = {"session": str, "tick": int, "seq": int, "time_s": float, "tool": str, "kind": str, "data": str}
+    table(db, "events").create(
+        event,
+        pk=("session", "tick", "seq"),
+        not_null=set(event),
+        foreign_keys=[("session", "sessions", "id")],
+        strict=True,
+    )
+    # data: zlib of little-endian float64, one packed row of poses (trainer.poses) per tick
+    inputs = {"session": str, "first_tick": int, "ticks": int, "data": bytes}
+    table(db, "inputs").create(
+        inputs,
+        pk=("session", "first_tick"),
+        not_null=set(inputs),
+        foreign_keys=[("session", "sessions", "id")],
+        strict=True,
+    )
+    metric = {
+        "session": str, "name": str, "value": float, "unit": str, "target_low": float, "target_high": float,
+        "source": str, "version": str,
+    }  # fmt: skip
+    table(db, "metrics").create(
+        metric,
+        pk=("session", "name"),
+        not_null=set(metric) - {"value", "target_low", "target_high"},
+        foreign_keys=[("session", "sessions", "id")],
+        strict=True,
+    )
+    # where each trainee's chain of seals ends, so that a missing last session shows
+    table(db, "chains").create(
+        {"trainee": int, "last": str},
+        pk="trainee",
+        not_null={"last"},
+        foreign_keys=[("trainee", "trainees", "id"), ("last", "sessions", "id")],
+        strict=True,
+    )
+
+
+def table(db: Database, name: str) -> Table:
+    """The table ``name``; in this schema no name belongs to a view."""
+    return db.table(name)
+
+
+def default_db_path() -> Path:
+    """The log that is used where none is named: ``TRAINER_DB``, or a file in the user's data folder."""
+    named = os.environ.get("TRAINER_DB")
+    return Path(named) if named else Path(platformdirs.user_data_dir("trainer", appauthor=False)) / "sessions.db"
+
+
+def new_session_id() -> str:
+    """A name for a session: UTC to the second, so that names sort by time, and 16 random bits."""
+    return f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{secrets.token_hex(2)}"
+
+
+def create_log(path: Path) -> Database:
+    """The log at ``path``, made (with its folder) where there is none. Raises LogError."""
+    with clear_errors(path):
+        if path.exists() and path.stat().st_size > 0:
+            return open_log(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        db = _connect(path)
+        try:
+            db.enable_wal()
+            migrations.apply(db)
+        except BaseException:
+            db.close()
+            raise
+    return db
+
+
+def open_log(path: Path) -> Database:
+    """The existing log at ``path``, foreign keys enforced; works as a context manager.
+
+    Raises LogError where there is none, the file is no log, or another version of its tables is needed.
+    """
+    if not path.is_file():
+        raise LogError(f"{path}: no log here; `trainer practice` makes one, --db or TRAINER_DB names another")
+    with clear_errors(path):
+        db = _connect(path)
+        try:
+            _check_version(db, path)
+        except BaseException:
+            db.close()
+            raise
+    return db
+
+
+def migrate(path: Path) -> list[str]:
+    """Bring the tables of the log at ``path`` up to date; the names of the steps taken. Raises LogError."""
+    if not path.is_file():
+        raise LogError(f"{path}: no log here, nothing to migrate")
+    with clear_errors(path), _connect(path) as db:
+        _check_own(db, path)
+        steps = [m.name for m in migrations.pending(db)]
+        migrations.apply(db)
+    return steps
+
+
+@contextmanager
+def clear_errors(path: Path) -> Iterator[None]:
+    """Turn errors of SQLite and of the file system into a LogError that names the log."""
+    try:
+        yield
+    except sqlite3.Error as error:
+        raise LogError(f"{path}: {_reason(error)}") from error
+    except OSError as error:
+        raise LogError(f"{path}: {error.strerror}") from error
+
+
+def path_of(db: Database) -> Path:
+    """The file behind a connection."""
+    return Path(next(row["file"] for row in db.query("select file from pragma_database_list where name = 'main'")))
+
+
+def _reason(error: sqlite3.Error) -> str:
+    name = getattr(error, "sqlite_errorname", "")
+    if name.startswith("SQLITE_FULL"):
+        return "the disk is full"
+    if name.startswith("SQLITE_IOERR"):
+        return "the disk refuses to write or read (full, over quota or gone)"
+    if name.startswith("SQLITE_NOTADB"):
+        return "not a log: not an SQLite file"
+    if name.startswith("SQLITE_CORRUPT"):
+        return f"damaged ({error}); restore a copy made by `trainer db backup`"
+    return str(error)
+
+
+def _connect(path: Path) -> Database:
+    db = Database(path)
+    db.conn.execute("pragma foreign_keys = on")
+    db.conn.execute("pragma synchronous = normal")
+    return db
+
+
+def _check_own(db: Database, path: Path) -> None:
+    """Raises LogError for somebody else's database and for tables that a newer program made."""
+    known = {m.name for m in migrations._migrations}
+    applied = {m.name for m in migrations.applied(db)}
+    if not applied:
+        raise LogError(f"{path}: not a log: an SQLite file of another program")
+    if applied - known:
+        raise LogError(f"{path}: written by a newer version of this program; update it with `pip install -U trainer`")
+
+
+def _check_version(db: Database, path: Path) -> None:
+    _check_own(db, path)
+    if migrations.pending(db):
+        raise LogError(f"{path}: written by an older version; run `trainer db backup COPY`, then `trainer db migrate`")
