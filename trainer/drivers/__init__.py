@@ -13,12 +13,18 @@ from trainer.drivers.driver import Driver
 from trainer.poses import ToolPoses
 from trainer.profile import Profile, ProfileFile, load_profile, parse_profile
 
-__all__ = ["Driver", "is_recording", "open_driver", "open_profile", "recording_path"]
+__all__ = ["Driver", "is_logged", "is_recording", "open_driver", "open_profile", "recording_path"]
+
+
+def is_logged(reference: str) -> bool:
+    """Whether ``reference`` is ``PATH.db#SESSION``, a session of our own log."""
+    db, separator, session = reference.rpartition("#")
+    return bool(separator and session) and db.endswith(".db")
 
 
 def is_recording(reference: str) -> bool:
     """Whether ``reference`` names a recording (``*.mha``, ``PATH.db#SESSION``) and not a profile."""
-    return reference.endswith(".mha") or _is_logged(reference)
+    return reference.endswith(".mha") or is_logged(reference)
 
 
 def open_profile(reference: str) -> ProfileFile:
@@ -28,7 +34,7 @@ def open_profile(reference: str) -> ProfileFile:
     """
     if not is_recording(reference):
         return load_profile(reference)
-    name = "logged-session" if _is_logged(reference) else "plus-sequence"
+    name = "logged-session" if is_logged(reference) else "plus-sequence"
     template = config.read_text(data_folder("devices") / f"{name}.toml")
     text = template.replace('path = ""', f"path = {json.dumps(reference, ensure_ascii=False)}", 1)
     return ProfileFile(path=reference, text=text, profile=parse_profile(text, reference))
@@ -59,7 +65,7 @@ def _driver(file: ProfileFile, profile: Profile, task: Task, home: ToolPoses, se
         return ScriptedHands(profile.hand, task, home, seed)
     path = recording_path(file)
     tools = [instrument.tool for instrument in task.scene.instrument]
-    if _is_logged(path):
+    if is_logged(path):
         from trainer.drivers.logged import LoggedSession
 
         db, _, session = path.rpartition("#")
@@ -68,8 +74,3 @@ def _driver(file: ProfileFile, profile: Profile, task: Task, home: ToolPoses, se
 
     assert profile.recording is not None
     return Recording(Path(path), profile.recording, tools, task.tick_hz, home)
-
-
-def _is_logged(reference: str) -> bool:
-    db, separator, session = reference.rpartition("#")
-    return bool(separator and session) and db.endswith(".db")

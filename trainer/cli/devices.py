@@ -1,0 +1,114 @@
+"""``trainer devices``: what can move the instruments, and whether a profile or a recording is in order."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+app = typer.Typer(help="What moves the instruments.", no_args_is_help=True)
+
+JsonOption = Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")]
+
+
+@app.command("list")
+def list_(as_json: JsonOption = False) -> None:
+    """List the shipped device profiles."""
+    from trainer import profile
+
+    found = [profile.load_profile(name).profile for name in profile.profile_names()]
+    rows = [{"name": p.name, "driver": p.driver, "summary": p.summary} for p in found]
+    if as_json:
+        print(json.dumps(rows, indent=2))
+        return
+    for row in rows:
+        print(f"{row['name']:<18} {row['driver']:<10} {row['summary']}")
+
+
+@app.command()
+def check(
+    path: Annotated[str, typer.Argument(metavar="PATH", help="A profile's .toml file, its name, or a recording.")],
+    as_json: JsonOption = False,
+) -> None:
+    """Check a device profile or a recording, and say what a recording holds; exit code 1 when something is wrong."""
+    from trainer.config import ConfigError
+
+    problems: list[str] = []
+    recording: dict[str, Any] | None = None
+    try:
+        recording = _check(path)
+    except ConfigError as error:
+        problems.append(str(error))
+    if as_json:
+        print(json.dumps({"path": path, "problems": problems, "recording": recording}, indent=2))
+    elif problems:
+        for problem in problems:
+            typer.echo(problem, err=True)
+    else:
+        print(f"{path}: in order")
+        if recording is not None:
+            _print_recording(recording)
+    if problems:
+        raise typer.Exit(1)
+
+
+def _check(reference: str) -> dict[str, Any] | None:
+    """What the recording behind ``reference`` holds; None for a profile that names none. Raises ConfigError."""
+    from trainer import drivers
+    from trainer.config import ConfigError
+    from trainer.drivers.recording import check_sensors
+    from trainer.drivers.sequence_file import describe, read
+
+    file = drivers.open_profile(reference)
+    if reference.endswith(".toml") and file.profile.name != Path(reference).stem:
+        raise ConfigError(f"{reference}: 'name' must equal the file's name, found '{file.profile.name}'")
+    spec = file.profile.recording
+    if file.profile.driver != "recording" or spec is None or not spec.path:
+        return None
+    path = drivers.recording_path(file)
+    if drivers.is_logged(path):
+        return _logged(path)
+    sequence = read(path)
+    if not drivers.is_recording(reference):  # a recording on its own need not have the sensors of the shipped profile
+        check_sensors(sequence, spec)
+    return {"path": path, **describe(sequence)}
+
+
+def _logged(reference: str) -> dict[str, Any]:
+    from trainer.config import ConfigError
+    from trainer.log import reader
+    from trainer.log.schema import LogError
+
+    path, _, session = reference.rpartition("#")
+    try:
+        with reader.open_log(Path(path)) as log:
+            record = reader.load(log, session)
+    except LogError as error:
+        raise ConfigError(str(error)) from None
+    return {
+        "path": path,
+        "session": record.header.id,
+        "task": record.header.task,
+        "frames": len(record.position),
+        "duration_s": record.duration_s,
+        "tools": list(record.header.tools),
+    }
+
+
+def _print_recording(recording: dict[str, Any]) -> None:
+    print(f"{recording['frames']} frames, {recording['duration_s']:.2f} s")
+    if "session" in recording:
+        print(f"session {recording['session']} of {recording['task']}: {', '.join(recording['tools'])}")
+        return
+    print(
+        f"interval median {recording['interval_median_ms']:.1f} ms, p99 {recording['interval_p99_ms']:.1f} ms, "
+        f"max {recording['interval_max_ms']:.1f} ms"
+    )
+    print(f"{recording['gaps']} gaps, {recording['missing_frames']} missing frames")
+    for name, sensor in recording["sensors"].items():
+        print(f"{name}: {sensor['frames_ok']} frames OK, path {sensor['path_length_mm']:.1f} mm")
+        if sensor["low_mm"] is not None:
+            for axis, low, high in zip("xyz", sensor["low_mm"], sensor["high_mm"], strict=True):
+                print(f"  {axis} {low:.2f} to {high:.2f} mm")
