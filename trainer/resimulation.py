@@ -1,0 +1,53 @@
+"""A stored session run again through the scene, and compared with what was recorded.
+
+Same inputs, same machine, same versions: the same events bit for bit. Events that depend on the machine's
+clock (``simulated = False``) are left out on both sides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from itertools import zip_longest
+
+from trainer import curriculum, scene
+from trainer.events import Event, TaskDone, payload
+from trainer.log.record import SessionRecord
+from trainer.poses import ToolPoses
+
+
+def resimulate(record: SessionRecord, rows: Iterable[int] | None = None) -> list[Event]:
+    """The events of the stored tool poses, stepped through a fresh scene of the stored task.
+
+    ``rows`` are the indices of the stored ticks; a progress bar may wrap them. Raises ConfigError when the
+    stored task no longer fits this version of the program.
+    """
+    running = scene.build(curriculum.parse_task(record.header.task_toml, record.header.task))
+    found: list[Event] = []
+    for i in range(len(record.position)) if rows is None else rows:
+        found += running.step(
+            ToolPoses(record.position[i], record.quaternion[i], record.closure[i], record.valid[i]),
+        )
+        if running.outcome:
+            return found
+    done = next((e for e in record.events if isinstance(e, TaskDone)), None)
+    if done is not None:
+        found += running.finish(done.outcome, done.reason)
+    return found
+
+
+def first_difference(recorded: Iterable[Event], again: Iterable[Event]) -> str | None:
+    """Both sides of the first event that is not the same bit for bit; None where all are."""
+    pairs = zip_longest(_simulated(recorded), _simulated(again), fillvalue="nothing")
+    for number, (before, after) in enumerate(pairs, 1):
+        if before != after:
+            return f"event {number} differs\n  recorded: {before}\n  replayed: {after}"
+    return None
+
+
+def _simulated(events: Iterable[Event]) -> list[str]:
+    """One line for each event; the text of a float holds all its bits."""
+    return [
+        f"tick {e.tick}, {e.seq}: {e.time_s!r} s {e.kind} {e.tool or '-'} {payload(e)}"
+        for e in sorted(events, key=lambda e: (e.tick, e.seq))
+        if e.simulated
+    ]
