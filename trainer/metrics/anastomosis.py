@@ -1,0 +1,93 @@
+"""How a stitch joins two ends of a vessel: equal bites, opposite each other, edges together."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from trainer.curriculum import VesselSpec
+from trainer.geometry import Array, cross, unit
+from trainer.metrics.performance import Performance, wrap_deg
+from trainer.metrics.registry import joins, metric
+
+
+def rest_point(vessel: VesselSpec, axial_mm: float, clock_deg: float) -> Array:
+    """Place (3,) mm on the outer surface of a vessel at rest, in the frame of the scene.
+
+    12 o'clock is the scene's +z made perpendicular to the axis (+x for an upright vessel). The clock runs in
+    one sense on both ends of a vessel: looking along the scene's +x (or, across it, +y, then +z).
+    """
+    axis = unit(vessel.axis)
+    twelve = unit(_across(np.array([0.0, 0.0, 1.0]), axis) if abs(axis[2]) < 0.999 else _across(np.eye(3)[0], axis))
+    along = axis * next(np.sign(a) for a in axis if abs(a) > 1e-9)
+    three = cross(along, twelve)
+    psi = math.radians(clock_deg)
+    radial = math.cos(psi) * twelve + math.sin(psi) * three
+    return np.asarray(np.asarray(vessel.cut_edge_mm) + axial_mm * axis + 0.5 * vessel.outer_diameter_mm * radial)
+
+
+def _across(v: Array, axis: Array) -> Array:
+    return v - float(v @ axis) * axis
+
+
+@metric("bite_asymmetry", "ratio", joins)
+def bite_asymmetry(performance: Performance, _: str) -> float | None:
+    """Difference of the stitch's two bites over their mean; 0 is equal bites."""
+    stitch = performance.stitch
+    if stitch is None:
+        return None
+    a, b = stitch.entry.axial_mm, stitch.exit.axial_mm
+    return 2.0 * abs(a - b) / (a + b) if a + b > 0.0 else None
+
+
+@metric("side_mismatch_mm", "mm", joins)
+def side_mismatch(performance: Performance, _: str) -> float | None:
+    """Distance around the vessel between the stitch's two bites: R · |clock difference|.
+
+    R is the mean outer radius of the two ends. A mismatch turns the ends against each other.
+    """
+    stitch = performance.stitch
+    if stitch is None:
+        return None
+    radius = 0.25 * sum(performance.vessels[p.body].outer_diameter_mm for p in (stitch.entry, stitch.exit))
+    return radius * math.radians(abs(wrap_deg(stitch.entry.clock_deg - stitch.exit.clock_deg)))
+
+
+@metric("obliquity_deg", "deg", joins)
+def obliquity(performance: Performance, _: str) -> float | None:
+    """Angle of the stitch to the vessel's axis; 0 is across the cut at right angles.
+
+    Between the two outer holes, both carried back to the vessels at rest, so that it judges where the
+    needle went through the tissue and not how the ends were held meanwhile. The axis is the first end's.
+    """
+    stitch = performance.stitch
+    if stitch is None:
+        return None
+    vessel = performance.vessels[stitch.entry.body]
+    start = rest_point(vessel, stitch.entry.axial_mm, stitch.entry.clock_deg)
+    end = rest_point(performance.vessels[stitch.exit.body], stitch.exit.axial_mm, stitch.exit.clock_deg)
+    axis = unit(vessel.axis)
+    along = abs(float((end - start) @ axis))
+    across = float(np.linalg.norm(_across(end - start, axis)))
+    return math.degrees(math.atan2(across, along)) if along + across > 0.0 else None
+
+
+@metric("stitch_count", "count", joins)
+def stitch_count(performance: Performance, _: str) -> float:
+    """Stitches in place at the end: from outside into one end and out of the other, with needle or thread in them."""
+    return float(len(performance.stitches))
+
+
+@metric("tail_mm", "mm", joins)
+def tail(performance: Performance, _: str) -> float | None:
+    """Thread left before the first hole when the exercise ended."""
+    end = performance.end
+    return end.tail_mm if end is not None and performance.stitch is not None else None
+
+
+@metric("gap_mm", "mm", joins)
+def gap(performance: Performance, _: str) -> float | None:
+    """Distance of the two ends' edges at the stitch when the exercise ended."""
+    end = performance.end
+    return end.gap_mm if end is not None and performance.stitch is not None else None
