@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -9,7 +10,9 @@ import pytest
 
 from tests.metrics.synthetic_session import STITCH, pierce, pull_through, record, stitch, task_of
 from tests.metrics.synthetic_session import withdraw as withdrawn
+from trainer.anatomy.vessel import frame
 from trainer.events import Event
+from trainer.geometry import unit
 from trainer.metrics import score
 from trainer.metrics.anastomosis import rest_point
 
@@ -50,6 +53,19 @@ def test_the_clock_runs_in_one_sense_on_both_ends() -> None:
         apart = rest_point(b, 0.3, clock) - rest_point(a, 0.3, clock)
         np.testing.assert_allclose(apart, [1.0, 0.0, 0.0], atol=1e-15)
     assert rest_point(a, 0.0, 0.0)[2] == pytest.approx(0.5)
+
+
+AXES = [(1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.3, -0.5, 0.2), (0.0, 0.0, 2.0), (0.0, -1.0, 0.0)]
+
+
+@pytest.mark.parametrize("axis", AXES)
+def test_places_at_rest_are_those_of_the_simulated_vessel(axis: tuple[float, float, float]) -> None:
+    """The metrics may not import the vessel, yet 12 and 3 o'clock must mean the same; 1e-15 of 1 mm for rounding."""
+    spec = dataclasses.replace(task_of().scene.vessel[0], axis=axis)
+    along, twelve, three = frame(unit(axis))
+    for clock, radial in ((0.0, twelve), (90.0, three), (180.0, -twelve)):
+        there = np.asarray(spec.cut_edge_mm) + 0.3 * along + 0.5 * radial
+        np.testing.assert_allclose(rest_point(spec, 0.3, clock), there, atol=2e-15)
 
 
 def test_a_withdrawn_hole_makes_no_stitch() -> None:

@@ -15,13 +15,15 @@ from trainer.metrics.registry import joins, metric
 def rest_point(vessel: VesselSpec, axial_mm: float, clock_deg: float) -> Array:
     """Place (3,) mm on the outer surface of a vessel at rest, in the frame of the scene.
 
-    12 o'clock is the scene's +z made perpendicular to the axis (+x for an upright vessel). The clock runs in
-    one sense on both ends of a vessel: looking along the scene's +x (or, across it, +y, then +z).
+    12 o'clock is the scene's +z made perpendicular to the axis (+y for an axis along z). 3 o'clock belongs to
+    the line of the axis, not to its direction: its y is positive, or its x where y is 0, so that the clock
+    runs in one sense on two facing ends.
     """
     axis = unit(vessel.axis)
-    twelve = unit(_across(np.array([0.0, 0.0, 1.0]), axis) if abs(axis[2]) < 0.999 else _across(np.eye(3)[0], axis))
-    along = axis * next(np.sign(a) for a in axis if abs(a) > 1e-9)
-    three = cross(along, twelve)
+    up = np.array([0.0, 0.0, 1.0]) if abs(axis[2]) < 1.0 - 1e-9 else np.array([0.0, 1.0, 0.0])
+    twelve = unit(_across(up, axis))
+    three = cross(axis, twelve)
+    three = three if (three[1] if abs(three[1]) > 1e-9 else three[0]) > 0.0 else -three
     psi = math.radians(clock_deg)
     radial = math.cos(psi) * twelve + math.sin(psi) * three
     return np.asarray(np.asarray(vessel.cut_edge_mm) + axial_mm * axis + 0.5 * vessel.outer_diameter_mm * radial)
@@ -31,7 +33,7 @@ def _across(v: Array, axis: Array) -> Array:
     return v - float(v @ axis) * axis
 
 
-@metric("bite_asymmetry", "ratio", joins)
+@metric("bite_asymmetry", "ratio", joins, better="lower")
 def bite_asymmetry(performance: Performance, _: str) -> float | None:
     """Difference of the stitch's two bites over their mean; 0 is equal bites."""
     stitch = performance.stitch
@@ -41,7 +43,7 @@ def bite_asymmetry(performance: Performance, _: str) -> float | None:
     return 2.0 * abs(a - b) / (a + b) if a + b > 0.0 else None
 
 
-@metric("side_mismatch_mm", "mm", joins)
+@metric("side_mismatch_mm", "mm", joins, better="lower")
 def side_mismatch(performance: Performance, _: str) -> float | None:
     """Distance around the vessel between the stitch's two bites: R · |clock difference|.
 
@@ -54,7 +56,7 @@ def side_mismatch(performance: Performance, _: str) -> float | None:
     return radius * math.radians(abs(wrap_deg(stitch.entry.clock_deg - stitch.exit.clock_deg)))
 
 
-@metric("obliquity_deg", "deg", joins)
+@metric("obliquity_deg", "deg", joins, better="lower")
 def obliquity(performance: Performance, _: str) -> float | None:
     """Angle of the stitch to the vessel's axis; 0 is across the cut at right angles.
 
@@ -86,7 +88,7 @@ def tail(performance: Performance, _: str) -> float | None:
     return end.tail_mm if end is not None and performance.stitch is not None else None
 
 
-@metric("gap_mm", "mm", joins)
+@metric("gap_mm", "mm", joins, better="lower")
 def gap(performance: Performance, _: str) -> float | None:
     """Distance of the two ends' edges at the stitch when the exercise ended."""
     end = performance.end

@@ -38,31 +38,31 @@ def wall_grasps(performance: Performance, _: str) -> float:
     return float(sum(e.target == "wall" for e in performance.events(Grasp)))
 
 
-@metric("overforce_count", "count")
+@metric("overforce_count", "count", better="lower")
 def overforces(performance: Performance, _: str) -> float:
     """How often a force or pressure rose above the task's limits; once per excursion."""
     return _count(performance, Overforce)
 
 
-@metric("slip_count", "count")
+@metric("slip_count", "count", better="lower")
 def slips(performance: Performance, _: str) -> float:
     """How often a held thing slid out of the jaws."""
     return _count(performance, Slip)
 
 
-@metric("drop_count", "count", _needle)
+@metric("drop_count", "count", _needle, better="lower")
 def drops(performance: Performance, _: str) -> float:
     """How often the needle was let go with nothing to hold it."""
     return _count(performance, Drop)
 
 
-@metric("tear_count", "count", _vessel)
+@metric("tear_count", "count", _vessel, better="lower")
 def tears(performance: Performance, _: str) -> float:
     """How often a wall gave way: a hole that ripped out, or tissue torn by the jaws."""
     return _count(performance, Tear)
 
 
-@metric("break_count", "count", _thread)
+@metric("break_count", "count", _thread, better="lower")
 def breaks(performance: Performance, _: str) -> float:
     """How often the thread broke."""
     return _count(performance, Break)
@@ -74,13 +74,13 @@ def puncture_force(performance: Performance, _: str) -> float | None:
     return max((p.force_mN for p in performance.crossings), default=None)
 
 
-@metric("wall_grasp_force_max_mN", "mN", _vessel)
+@metric("wall_grasp_force_max_mN", "mN", _vessel, better="lower")
 def wall_grasp_force(performance: Performance, _: str) -> float | None:
     """Largest force of the jaws as they took hold of a vessel's wall."""
     return max((e.force_mN for e in performance.events(Grasp) if e.target == "wall"), default=None)
 
 
-@metric("tracking_lost_s", "s")
+@metric("tracking_lost_s", "s", better="lower")
 def tracking_lost(performance: Performance, _: str) -> float:
     """Time in which the device did not see at least one instrument."""
     unseen = ~np.all(performance.record.valid, axis=1)

@@ -28,7 +28,7 @@ def runs(flags: NDArray[np.bool_]) -> NDArray[np.intp]:
     return edges.reshape(len(edges) // 2, 2)
 
 
-@metric("time_s", "s", version=f"1; {FILTER}; motion from {IDLE_MM_S:g} mm/s")
+@metric("time_s", "s", better="lower", version=f"1; {FILTER}; motion from {IDLE_MM_S:g} mm/s")
 def time(performance: Performance, _: str) -> float | None:
     """Time from the first motion of an instrument to the last step; to the end where steps were left undone."""
     record = performance.record
@@ -44,14 +44,14 @@ def time(performance: Performance, _: str) -> float | None:
     return max(end - min(starts), 0.0)
 
 
-@metric("path_length_{tool}_mm", "mm", version=f"1; {FILTER}")
+@metric("path_length_{tool}_mm", "mm", better="lower", version=f"1; {FILTER}")
 def path_length(performance: Performance, tool: str) -> float | None:
     """Length of the instrument's way; a gap in tracking counts as its straight line."""
     track = performance.tracks.get(tool)
     return None if track is None else float(np.sum(track.step_mm))
 
 
-@metric("economy_{tool}", "ratio", version=f"1; {FILTER}")
+@metric("economy_{tool}", "ratio", better="higher", version=f"1; {FILTER}")
 def economy(performance: Performance, tool: str) -> float | None:
     """Straight lines between the places where the instrument did something, over its way between them; 1 is direct.
 
@@ -88,6 +88,7 @@ def idle(performance: Performance, _: str) -> float | None:
 @metric(
     "movements_{tool}",
     "count",
+    better="lower",
     version=f"1; {FILTER}; from {MOVE_ON_MM_S:g} mm/s to {MOVE_OFF_MM_S:g} mm/s, at least {MOVE_S:g} s",
 )
 def movements(performance: Performance, tool: str) -> float | None:

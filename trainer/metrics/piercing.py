@@ -35,7 +35,7 @@ def _entry_angles(performance: Performance) -> list[float]:
     return [a for p in performance.entries if (a := crossing_angle_deg(p)) is not None]
 
 
-@metric("entry_angle_deg", "deg", pierces)
+@metric("entry_angle_deg", "deg", pierces, better="higher")
 def entry_angle(performance: Performance, _: str) -> float | None:
     """Angle of the needle to the wall as it enters, median over the passes; 90 is upright.
 
@@ -51,14 +51,14 @@ def entry_angle(performance: Performance, _: str) -> float | None:
     return median(angles) if angles else None
 
 
-@metric("entry_angle_error_deg", "deg", pierces)
+@metric("entry_angle_error_deg", "deg", pierces, better="lower")
 def entry_angle_error(performance: Performance, _: str) -> float | None:
     """How far the entries are from upright: mean of |90 - entry angle| over the passes."""
     angles = _entry_angles(performance)
     return fmean(90.0 - a for a in angles) if angles else None
 
 
-@metric("exit_angle_deg", "deg", joins)
+@metric("exit_angle_deg", "deg", joins, better="higher")
 def exit_angle(performance: Performance, _: str) -> float | None:
     """Angle of the needle to the outer wall of the second end as it comes out there, median.
 
@@ -94,7 +94,7 @@ def clock(performance: Performance, vessel: str) -> float | None:
     return bites[-1].clock_deg % 360.0 if bites else None
 
 
-@metric("placement_error_mm", "mm", pierces)
+@metric("placement_error_mm", "mm", pierces, better="lower")
 def placement_error(performance: Performance, _: str) -> float | None:
     """Distance on the wall between the pierced place and the step's mark, mean over the steps done.
 
@@ -109,7 +109,7 @@ def placement_error(performance: Performance, _: str) -> float | None:
     return fmean(errors) if errors else None
 
 
-@metric("depth_fraction", "ratio", pierces)
+@metric("depth_fraction", "ratio", pierces, better="higher")
 def depth_fraction(performance: Performance, _: str) -> float | None:
     """Share of the wall's thickness that the shallowest pass reached; 1 is all of it.
 
@@ -120,13 +120,13 @@ def depth_fraction(performance: Performance, _: str) -> float | None:
     return min(depths, default=None)
 
 
-@metric("partial_thickness_count", "count", pierces)
+@metric("partial_thickness_count", "count", pierces, better="lower")
 def partial_thickness(performance: Performance, _: str) -> float:
     """Passes that ended without having gone through both walls of a vessel that they entered."""
     return float(sum(not w.full_thickness and w.reached_mm is not None for w in performance.wall_passes))
 
 
-@metric("back_wall_catches", "count", pierces)
+@metric("back_wall_catches", "count", pierces, better="lower")
 def back_wall_catches(performance: Performance, _: str) -> float:
     """Passes that crossed one vessel's wall at places more than 90 degrees of the clock apart."""
     return float(
@@ -137,7 +137,7 @@ def back_wall_catches(performance: Performance, _: str) -> float:
     )
 
 
-@metric("extra_holes", "count", pierces)
+@metric("extra_holes", "count", pierces, better="lower")
 def extra_holes(performance: Performance, _: str) -> float:
     """Holes in the outer walls beyond those that the task's steps ask for.
 

@@ -11,11 +11,15 @@ import inspect
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Literal
 
 from trainer.config import ConfigError
 from trainer.curriculum import MetricTarget, Task
 from trainer.log.record import Metric, SessionRecord
 from trainer.metrics.performance import Performance
+
+#: Which way a value improves; "" where only a target can tell.
+Better = Literal["lower", "higher", ""]
 
 NO_TARGET = "no target"
 
@@ -32,6 +36,7 @@ class Definition:
     version: str
     measure: Measure
     applies: Callable[[Task], bool]
+    better: Better
 
     @property
     def meaning(self) -> str:
@@ -70,14 +75,14 @@ def joins(task: Task) -> bool:
 
 
 def metric(
-    name: str, unit: str, applies: Callable[[Task], bool] = always, version: str = "1"
+    name: str, unit: str, applies: Callable[[Task], bool] = always, *, better: Better = "", version: str = "1"
 ) -> Callable[[Measure], Measure]:
     """Registers a function as the metric ``name``. Raises ValueError for a second one of that name."""
 
     def register(measure: Measure) -> Measure:
         if name in REGISTRY:
             raise ValueError(f"metric '{name}' is registered twice")
-        REGISTRY[name] = Definition(name, unit, version, measure, applies)
+        REGISTRY[name] = Definition(name, unit, version, measure, applies, better)
         return measure
 
     return register
