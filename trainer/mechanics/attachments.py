@@ -1,0 +1,224 @@
+"""What holds a tissue at material points: springs to places in the world and taut threads.
+
+A material point is a weighted mean of three nodes. At most a few dozen are held at a time, so that everything here is
+a small dense problem in the 3 u coordinates of the u points in use.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from trainer.geometry import Array
+
+#: A segment shorter than this, mm, has no direction of its own; below it a thread's pull turns no further.
+SHORTEST_MM = 1e-6
+
+
+@dataclass(frozen=True)
+class Anchors:
+    """Springs from material points to places: the force on the tissue is ``stiffness`` (``target`` - p)."""
+
+    slot: np.ndarray  # (a,) int, from Equilibrium.hold
+    target: Array  # (a, 3) mm
+    stiffness: Array  # (a, 3, 3) mN/mm, symmetric positive semidefinite
+
+    @staticmethod
+    def none() -> Anchors:
+        return Anchors(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+
+
+@dataclass(frozen=True)
+class Cable:
+    """A thread without friction through k points: it pulls, and never pushes, so that its path is not too long."""
+
+    slot: np.ndarray  # (k,) int; -1 for a point that is no material point
+    place: Array  # (k, 3) mm, where that point is; not read elsewhere
+    length_mm: float
+
+
+@dataclass(frozen=True)
+class Loads:
+    """Given forces at material points."""
+
+    slot: np.ndarray  # (l,) int
+    force: Array  # (l, 3) mN
+
+    @staticmethod
+    def none() -> Loads:
+        return Loads(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Anchors, cables and loads of one solve, flattened for the kernels; ``at`` counts the points in use."""
+
+    slots: np.ndarray  # (u,) the slots in use, ascending
+    anchor_at: np.ndarray  # (a,)
+    target: Array  # (a, 3) mm; changed while targets are approached in steps
+    stiffness: Array  # (a, 3, 3) mN/mm
+    cable_start: np.ndarray  # (c + 1,) a cable's points in the next two
+    cable_at: np.ndarray  # (k,) -1 for a place in the world
+    cable_place: Array  # (k, 3) mm
+    length: Array  # (c,) mm; changed while lengths are approached in steps
+    load: Array  # (u, 3) mN
+
+
+def flatten(anchors: Anchors, cables: tuple[Cable, ...], loads: Loads) -> Rows:
+    """The rows of one solve. Raises ValueError when a number is not finite or a cable has fewer than two points."""
+    cable_slot = np.concatenate([np.zeros(0, dtype=np.int64), *(c.slot for c in cables)]).astype(np.int64)
+    cable_place = np.concatenate([np.zeros((0, 3)), *(np.asarray(c.place, dtype=np.float64) for c in cables)])
+    cable_place = np.where((cable_slot == -1)[:, None], cable_place, 0.0)
+    length = np.array([c.length_mm for c in cables], dtype=np.float64)
+    for name, values in (
+        ("an anchor's target", anchors.target),
+        ("an anchor's stiffness", anchors.stiffness),
+        ("a cable's place", cable_place),
+        ("a cable's length", length),
+        ("a load", loads.force),
+    ):
+        if not np.all(np.isfinite(values)):
+            raise ValueError(f"{name} is not finite")
+    if any(len(c.slot) < 2 for c in cables):
+        raise ValueError("a cable needs at least two points")
+    slots = np.unique(np.concatenate([anchors.slot, cable_slot[cable_slot >= 0], loads.slot])).astype(np.int64)
+    load = np.zeros((len(slots), 3))
+    np.add.at(load, np.searchsorted(slots, loads.slot), loads.force)
+    return Rows(
+        slots=slots,
+        anchor_at=np.searchsorted(slots, anchors.slot).astype(np.int64),
+        target=np.array(anchors.target, dtype=np.float64),
+        stiffness=np.ascontiguousarray(anchors.stiffness, dtype=np.float64),
+        cable_start=np.concatenate([[0], np.cumsum([len(c.slot) for c in cables])]).astype(np.int64),
+        cable_at=np.where(cable_slot < 0, -1, np.searchsorted(slots, cable_slot)).astype(np.int64),
+        cable_place=np.ascontiguousarray(cable_place),
+        length=length,
+        load=load,
+    )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def pull(
+    p: Array,
+    anchor_at: np.ndarray,
+    target: Array,
+    anchor_stiffness: Array,
+    cable_start: np.ndarray,
+    cable_at: np.ndarray,
+    cable_place: Array,
+    length: Array,
+    multiplier: Array,
+    penalty: Array,
+    load: Array,
+    row: Array,
+    force: Array,
+    matrix: Array,
+    stretch: Array,
+) -> float:
+    """Forces on the points in use, their stiffness and their energy (mN mm, returned).
+
+    A cable of path length s, longest length L, multiplier m and penalty k has the augmented Lagrangian
+    (T² - m²) / (2 k) with the tension T = max(0, m + k (s - L)) (Rockafellar 1973). Its second derivative,
+    k d dᵀ + T ∂²s/∂p² with d = ∂s/∂p, is positive semidefinite, because a path length is convex.
+
+    Reads ``p`` (u, 3) mm and the fields of Rows, ``multiplier`` (c,) mN, ``penalty`` (c,) mN/mm. Overwrites ``row``
+    (k, 3), ``force`` (u, 3) mN, ``matrix`` (3 u, 3 u) mN/mm and ``stretch`` (c,) = s - L mm.
+    """
+    energy = 0.0
+    matrix[:] = 0.0
+    for i in range(len(p)):
+        for r in range(3):
+            force[i, r] = load[i, r]
+            energy -= load[i, r] * p[i, r]
+    for a in range(len(anchor_at)):
+        i = anchor_at[a]
+        for r in range(3):
+            f = 0.0
+            for c in range(3):
+                f += anchor_stiffness[a, r, c] * (target[a, c] - p[i, c])
+                matrix[3 * i + r, 3 * i + c] += anchor_stiffness[a, r, c]
+            force[i, r] += f
+            energy += 0.5 * f * (target[a, r] - p[i, r])
+    for n in range(len(length)):
+        first, last = cable_start[n], cable_start[n + 1]
+        path = 0.0
+        for k in range(first, last):
+            row[k, 0] = row[k, 1] = row[k, 2] = 0.0
+        for k in range(first, last - 1):
+            i, j = cable_at[k], cable_at[k + 1]
+            d0 = (p[j, 0] if j >= 0 else cable_place[k + 1, 0]) - (p[i, 0] if i >= 0 else cable_place[k, 0])
+            d1 = (p[j, 1] if j >= 0 else cable_place[k + 1, 1]) - (p[i, 1] if i >= 0 else cable_place[k, 1])
+            d2 = (p[j, 2] if j >= 0 else cable_place[k + 1, 2]) - (p[i, 2] if i >= 0 else cable_place[k, 2])
+            s = math.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
+            path += s
+            s = max(s, SHORTEST_MM)
+            row[k, 0] -= d0 / s
+            row[k, 1] -= d1 / s
+            row[k, 2] -= d2 / s
+            row[k + 1, 0] += d0 / s
+            row[k + 1, 1] += d1 / s
+            row[k + 1, 2] += d2 / s
+        stretch[n] = path - length[n]
+        tension = max(0.0, multiplier[n] + penalty[n] * stretch[n])
+        energy += (tension * tension - multiplier[n] * multiplier[n]) / (2.0 * penalty[n])
+        if tension == 0.0:
+            continue
+        for k in range(first, last):
+            i = cable_at[k]
+            if i < 0:
+                continue
+            for r in range(3):
+                force[i, r] -= tension * row[k, r]
+            for m in range(first, last):
+                j = cable_at[m]
+                if j >= 0:
+                    for r in range(3):
+                        for c in range(3):
+                            matrix[3 * i + r, 3 * j + c] += penalty[n] * row[k, r] * row[m, c]
+        for k in range(first, last - 1):
+            i, j = cable_at[k], cable_at[k + 1]
+            d0 = (p[j, 0] if j >= 0 else cable_place[k + 1, 0]) - (p[i, 0] if i >= 0 else cable_place[k, 0])
+            d1 = (p[j, 1] if j >= 0 else cable_place[k + 1, 1]) - (p[i, 1] if i >= 0 else cable_place[k, 1])
+            d2 = (p[j, 2] if j >= 0 else cable_place[k + 1, 2]) - (p[i, 2] if i >= 0 else cable_place[k, 2])
+            s = max(math.sqrt(d0 * d0 + d1 * d1 + d2 * d2), SHORTEST_MM)
+            for r in range(3):
+                dr = d0 if r == 0 else (d1 if r == 1 else d2)
+                for c in range(3):
+                    dc = d0 if c == 0 else (d1 if c == 1 else d2)
+                    g = tension / s * ((1.0 if r == c else 0.0) - dr * dc / (s * s))
+                    if i >= 0:
+                        matrix[3 * i + r, 3 * i + c] += g
+                    if j >= 0:
+                        matrix[3 * j + r, 3 * j + c] += g
+                    if i >= 0 and j >= 0:
+                        matrix[3 * i + r, 3 * j + c] -= g
+                        matrix[3 * j + r, 3 * i + c] -= g
+    return energy
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def solve_dense(matrix: Array, v: Array) -> None:
+    """Overwrites ``v`` (n,) with matrix⁻¹ v, and ``matrix`` (n, n); Gaussian elimination with partial pivoting."""
+    n = len(v)
+    for j in range(n):
+        pivot = j
+        for i in range(j + 1, n):
+            if abs(matrix[i, j]) > abs(matrix[pivot, j]):
+                pivot = i
+        if pivot != j:
+            for k in range(j, n):
+                matrix[j, k], matrix[pivot, k] = matrix[pivot, k], matrix[j, k]
+            v[j], v[pivot] = v[pivot], v[j]
+        for i in range(j + 1, n):
+            multiplier = matrix[i, j] / matrix[j, j]
+            if multiplier != 0.0:
+                for k in range(j + 1, n):
+                    matrix[i, k] -= multiplier * matrix[j, k]
+                v[i] -= multiplier * v[j]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            v[i] -= matrix[i, k] * v[k]
+        v[i] /= matrix[i, i]

@@ -1,0 +1,177 @@
+"""The direction of a limited-memory quasi-Newton method (L-BFGS) whose base matrix is a kept factor.
+
+Nocedal and Wright, Numerical Optimization, algorithm 7.4. The secant pairs (s, y) are of the tissue alone; the
+stiffness A of what holds it at material points (W) is added when a pair is used, y + Wᵀ A W s, so that pairs stay
+true when holds come, go or change. The base (K + Wᵀ A W)⁻¹ follows from K⁻¹ by Woodbury's identity.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from trainer.geometry import Array
+from trainer.mechanics.attachments import solve_dense
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def dot(a: Array, b: Array, first: int, last: int) -> float:
+    """Σ a_i · b_i over the rows ``first`` … ``last`` - 1 of two arrays (n, 3), summed in four strands."""
+    u, v = a[first:last].reshape(-1), b[first:last].reshape(-1)
+    n = len(u)
+    whole = n - n % 4
+    s0 = s1 = s2 = s3 = 0.0
+    for i in range(0, whole, 4):
+        s0 += u[i] * v[i]
+        s1 += u[i + 1] * v[i + 1]
+        s2 += u[i + 2] * v[i + 2]
+        s3 += u[i + 3] * v[i + 3]
+    for i in range(whole, n):
+        s0 += u[i] * v[i]
+    return (s0 + s1) + (s2 + s3)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def add_scaled(a: float, source: Array, target: Array, first: int, last: int) -> None:
+    """target += a source on the rows ``first`` … ``last`` - 1 of arrays (n, 3)."""
+    u, v = source[first:last].reshape(-1), target[first:last].reshape(-1)
+    for i in range(len(u)):
+        v[i] += a * u[i]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def at_points(values: Array, nodes: np.ndarray, weights: Array, out: Array) -> None:
+    """W: the weighted means ``out`` (u, 3) of ``values`` (n, 3) at u material points."""
+    for i in range(len(nodes)):
+        for c in range(3):
+            out[i, c] = (
+                weights[i, 0] * values[nodes[i, 0], c]
+                + weights[i, 1] * values[nodes[i, 1], c]
+                + weights[i, 2] * values[nodes[i, 2], c]
+            )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def spread(scale: float, values: Array, nodes: np.ndarray, weights: Array, out: Array) -> None:
+    """Adds ``scale`` Wᵀ ``values``: shares the rows (u, 3) out to the nodes of ``out`` (n, 3)."""
+    for i in range(len(nodes)):
+        for k in range(3):
+            for c in range(3):
+                out[nodes[i, k], c] += scale * weights[i, k] * values[i, c]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def multiply(matrix: Array, v: Array, out: Array) -> None:
+    """``out`` = matrix · v, for ``matrix`` (3 u, 3 u) and rows (u, 3)."""
+    for i in range(len(v)):
+        for r in range(3):
+            total = 0.0
+            for j in range(len(v)):
+                for c in range(3):
+                    total += matrix[3 * i + r, 3 * j + c] * v[j, c]
+            out[i, r] = total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def before_base(
+    q: Array,
+    s: Array,
+    y: Array,
+    newest: int,
+    count: int,
+    matrix: Array,
+    nodes: np.ndarray,
+    weights: Array,
+    first: int,
+    last: int,
+    moved: Array,
+    pulled: Array,
+    curvature: Array,
+    share: Array,
+) -> None:
+    """The first loop: overwrites the gradient ``q`` (n, 3), newest pair first.
+
+    ``s``, ``y`` (m, n, 3) hold the pairs in a ring that ends at ``newest``. Overwrites ``moved``, ``pulled``
+    (m, u, 3), ``curvature`` and ``share`` (m,) for the second loop. A pair of no positive curvature is passed over.
+    """
+    pairs = len(s)
+    for age in range(count):
+        k = (newest - age) % pairs
+        at_points(s[k], nodes, weights, moved[k])
+        multiply(matrix, moved[k], pulled[k])
+        c = dot(s[k], y[k], first, last)
+        for i in range(len(nodes)):
+            for r in range(3):
+                c += moved[k, i, r] * pulled[k, i, r]
+        curvature[k] = c
+        share[k] = 0.0
+        if c > 0.0:
+            share[k] = dot(s[k], q, first, last) / c
+            add_scaled(-share[k], y[k], q, first, last)
+            spread(-share[k], pulled[k], nodes, weights, q)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def hold_base(
+    z: Array,
+    slots: np.ndarray,
+    nodes: np.ndarray,
+    weights: Array,
+    influence: Array,
+    slot_range: np.ndarray,
+    compliance: Array,
+    matrix: Array,
+    point: Array,
+    answer: Array,
+    system: Array,
+) -> None:
+    """Turns z = K⁻¹ q (n, 3) into (K + Wᵀ A W)⁻¹ q = z - K⁻¹ Wᵀ (I + A C)⁻¹ A W z, with C = W K⁻¹ Wᵀ.
+
+    ``influence`` (slots, 3, n, 3) holds the columns K⁻¹ Wᵀ, zero outside the rows ``slot_range`` (slots, 2);
+    ``compliance`` is C over all slots. Overwrites ``point``, ``answer`` (u, 3), ``system`` (3 u, 3 u).
+    """
+    u = len(slots)
+    at_points(z, nodes, weights, point)
+    multiply(matrix, point, answer)
+    for i in range(3 * u):
+        for j in range(3 * u):
+            total = 1.0 if i == j else 0.0
+            column = 3 * slots[j // 3] + j % 3
+            for k in range(3 * u):
+                total += matrix[i, k] * compliance[3 * slots[k // 3] + k % 3, column]
+            system[i, j] = total
+    solve_dense(system, answer.reshape(-1))
+    for i in range(u):
+        lo, hi = slot_range[slots[i], 0], slot_range[slots[i], 1]
+        for r in range(3):
+            add_scaled(-answer[i, r], influence[slots[i], r], z, lo, hi)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def after_base(
+    z: Array,
+    s: Array,
+    y: Array,
+    newest: int,
+    count: int,
+    nodes: np.ndarray,
+    weights: Array,
+    first: int,
+    last: int,
+    pulled: Array,
+    curvature: Array,
+    share: Array,
+    point: Array,
+) -> None:
+    """The second loop: overwrites ``z`` (n, 3), oldest pair first."""
+    pairs = len(s)
+    for age in range(count - 1, -1, -1):
+        k = (newest - age) % pairs
+        if not curvature[k] > 0.0:
+            continue
+        at_points(z, nodes, weights, point)
+        c = dot(y[k], z, first, last)
+        for i in range(len(nodes)):
+            for r in range(3):
+                c += pulled[k, i, r] * point[i, r]
+        add_scaled(share[k] - c / curvature[k], s[k], z, first, last)
