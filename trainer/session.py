@@ -46,20 +46,21 @@ def run(
 ) -> None:
     """Run ``scene`` until it has an outcome; every sink gets one record per tick.
 
-    The last record carries the scene's closing events. Where the session ends because the input did or the
-    trainee interrupted it, that record is one of its own after ``scene.tick`` steps, with the poses held.
-    In real time an overrun is logged with the tick after it, when its length is known.
+    Where the session ends because the input did or the trainee interrupted it, the closing events come in a
+    second record of the last tick. An overrun is logged, in real time only, with the record after it, when its
+    length is known.
     """
     poses = scene.home
+    tick = 0
     late_ms = 0.0
     while not scene.outcome:
         clock.begin()
-        tick = scene.tick
         if interrupted():
             events = scene.finish("aborted", "interrupted")
-        elif (seen := driver.poll(tick, scene.view())) is None:
+        elif (seen := driver.poll(scene.tick, scene.view())) is None:
             events = scene.finish("failed", "the input ended before the task was done")
         else:
+            tick = scene.tick
             poses = admit(seen, poses)
             events = scene.step(poses)
         if late_ms:
@@ -90,8 +91,10 @@ def admit(seen: ToolPoses, held: ToolPoses) -> ToolPoses:
 
 
 def _overrun(tick: int, events: tuple[Event, ...], work_ms: float, clock: Fast) -> TickOverrun:
-    """The last event of ``tick``: the work of the tick before it took ``work_ms``."""
-    seq = events[-1].seq + 1 if events else 0
+    """The event that follows ``events``: the tick before took ``work_ms``."""
+    seq = 0
+    if events:
+        tick, seq = events[-1].tick, events[-1].seq + 1
     return TickOverrun(tick, seq, tick / clock.tick_hz, "", work_ms=work_ms, slot_ms=clock.slot_ms)
 
 

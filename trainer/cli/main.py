@@ -49,7 +49,9 @@ def build_app() -> typer.Typer:
     """The command line with all its sub-commands."""
     import typer
 
-    from trainer.cli import curricula
+    from trainer.cli import curricula, db, devices, sessions
+    from trainer.cli.practice import practice
+    from trainer.cli.warmup import warmup
 
     app = typer.Typer(
         help="Training and assessment of surgical skill.",
@@ -59,7 +61,12 @@ def build_app() -> typer.Typer:
         add_completion=False,
     )
     app.callback()(keep_kernels)
+    app.command()(practice)
     app.add_typer(curricula.app, name="curricula")
+    app.add_typer(sessions.app, name="sessions")
+    app.add_typer(devices.app, name="devices")
+    app.add_typer(db.app, name="db")
+    app.command()(warmup)
     return app
 
 

@@ -1,0 +1,190 @@
+"""``trainer practice``: one exercise, from the device to the scores."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from contextlib import ExitStack, closing
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from trainer.curriculum import TaskFile
+    from trainer.log.record import SessionHeader
+    from trainer.profile import ProfileFile
+
+
+def practice(
+    task: Annotated[str, typer.Argument(metavar="FAMILY/TASK", help="What to practise, or a task's .toml file.")],
+    trainee: Annotated[str, typer.Option(help="Who practises; the log keeps sessions by this name.")] = "anonymous",
+    device: Annotated[
+        str, typer.Option(metavar="PROFILE|PATH", help="A device's name or .toml file, or a recording.")
+    ] = "scripted-expert",
+    seed: Annotated[int, typer.Option(min=0, help="Seed of a scripted hand's chance.")] = 0,
+    realtime: Annotated[bool, typer.Option("--realtime/--fast", help="At the task's pace, or without pauses.")] = True,
+    record: Annotated[
+        Path | None, typer.Option(metavar="PATH.rrd", help="The recording; by default in recordings/ beside the log.")
+    ] = None,
+    no_record: Annotated[bool, typer.Option("--no-record", help="Make no recording.")] = False,
+    db: Annotated[
+        Path | None, typer.Option(metavar="PATH", help="The log; by default TRAINER_DB or the user's data folder.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")] = False,
+) -> None:
+    """Run one exercise, log it and print its scores."""
+    if record is not None and no_record:
+        raise typer.BadParameter("--record and --no-record exclude each other")
+    if record is not None and record.suffix != ".rrd":
+        raise typer.BadParameter(f"--record needs a name that ends in .rrd, found {record}")
+
+    from trainer.curriculum import load_task
+    from trainer.log.schema import default_db_path, new_session_id
+
+    session_id = new_session_id()
+    log_path = db or default_db_path()
+    recording = None if no_record else record or log_path.parent / "recordings" / f"{session_id}.rrd"
+    with ExitStack() as stack:
+        result = _perform(stack, load_task(task), session_id, trainee, device, seed, realtime, log_path, recording)
+        if as_json:
+            print(json.dumps(result, indent=2, allow_nan=False))
+        else:
+            from trainer.cli.scores import print_result
+
+            print_result(result)
+    # A recording that could not be finished says so here, when everything else is stored and printed.
+
+
+def _perform(
+    stack: ExitStack,
+    task_file: TaskFile,
+    session_id: str,
+    trainee: str,
+    device: str,
+    seed: int,
+    realtime: bool,
+    log_path: Path,
+    recording_path: Path | None,
+) -> dict[str, Any]:
+    """Run one exercise and store it; the document that ``--json`` prints. ``stack`` closes what was opened.
+
+    Whatever can be refused is refused before the session enters the log. Raises ConfigError for a task or
+    device that cannot be used, LogError and RecordingError where they cannot be written.
+    """
+    from trainer.cli.progress import Progress
+    from trainer.cli.warmup import announce, warm_up
+    from trainer.clock import Fast, Realtime
+    from trainer.drivers import open_driver
+    from trainer.metrics.registry import check_targets, score
+    from trainer.scene import build
+    from trainer.session import interruptible, run
+    from trainer.sinks.log import LogSink
+    from trainer.sinks.recording import RecordingSink
+    from trainer.sinks.surface import Sink
+
+    task = task_file.task
+    check_targets(task)
+    if recording_path is not None:
+        _make_room(recording_path)
+    _close_interrupted(log_path)
+    announce()
+    scene = build(task)
+    profile, driver = open_driver(device, task, scene.home, seed)
+    stack.enter_context(closing(driver))
+    if realtime:
+        warm_up(task)
+    clock = (Realtime if realtime else Fast)(task.tick_hz)
+    header = _header(session_id, trainee, task_file, profile, seed, scene.tools, recording_path)
+    sinks: list[Sink] = []
+    recording = None
+    if recording_path is not None:
+        recording = RecordingSink(recording_path, header, scene.layout(), task.tick_hz, realtime=realtime)
+        sinks.append(stack.enter_context(closing(recording)))
+    log = stack.enter_context(closing(LogSink(log_path, header)))
+    with closing(Progress(task)) as progress, interruptible() as interrupted:
+        run(scene, driver, [log, *sinks, progress], clock, interrupted)
+    duration_s = scene.tick / task.tick_hz
+    stored = log.record(scene.outcome, scene.tick, duration_s)
+    metrics = score(stored, task)
+    if recording is not None:
+        recording.metrics(metrics)
+    pace, seen = clock.report(), driver.summary()
+    log.finish(scene.outcome, scene.reason, scene.tick, duration_s, pace, seen, metrics)
+    return {
+        "session": session_id,
+        "task": task_file.path,
+        "trainee": trainee,
+        "outcome": scene.outcome,
+        "reason": scene.reason,
+        "duration_s": duration_s,
+        "ticks": scene.tick,
+        "events": dict(Counter(event.kind for event in stored.events)),
+        "metrics": [asdict(metric) for metric in metrics],
+        "recording": None if recording_path is None else str(recording_path),
+        "log": str(log_path),
+        "realtime": pace,
+        "device": {"name": device, "seed": seed, **seen},
+    }
+
+
+def _header(
+    session_id: str,
+    trainee: str,
+    task_file: TaskFile,
+    profile: ProfileFile,
+    seed: int,
+    tools: tuple[str, ...],
+    recording: Path | None,
+) -> SessionHeader:
+    import platform
+    from datetime import UTC, datetime
+
+    import numba
+    import numpy as np
+
+    from trainer import __version__
+    from trainer.log.record import SessionHeader
+
+    return SessionHeader(
+        id=session_id,
+        trainee=trainee,
+        task=task_file.path,
+        task_toml=task_file.text,
+        task_sha256=task_file.sha256,
+        device=profile.path,
+        device_toml=profile.text,
+        device_sha256=profile.sha256,
+        seed=seed,
+        tick_hz=task_file.task.tick_hz,
+        tools=tools,
+        started_at=datetime.now(UTC).isoformat(timespec="milliseconds"),
+        versions={
+            "trainer": __version__,
+            "python": platform.python_version(),
+            "numpy": np.__version__,
+            "numba": numba.__version__,
+            "machine": f"{platform.system()} {platform.machine()}",
+        },
+        recording=None if recording is None else str(recording),
+    )
+
+
+def _make_room(recording: Path) -> None:
+    """Make the folder of a recording. Raises ConfigError where a recording is there already, and OSError."""
+    from trainer.config import ConfigError
+
+    if recording.exists():
+        raise ConfigError(f"{recording}: exists already; give --record another name, or remove it")
+    recording.parent.mkdir(parents=True, exist_ok=True)
+
+
+def _close_interrupted(log_path: Path) -> None:
+    """Make the log where there is none, and say which sessions of it were found without their end."""
+    from trainer.log.recovery import recover
+    from trainer.log.schema import create_log
+
+    with create_log(log_path) as log:
+        for found in recover(log):
+            typer.echo(f"trainer: {found}", err=True)
