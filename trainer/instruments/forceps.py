@@ -24,7 +24,7 @@ BLADE_MM = 12.0
 OPEN_GAP_MM = 1.0
 #: Width (along z) and thickness (along y) of a blade at its tip and at its axis, mm.
 TIP_WIDTH_MM, TIP_THICKNESS_MM = 0.10, 0.08
-ROOT_WIDTH_MM, ROOT_THICKNESS_MM = 1.20, 0.60
+ROOT_WIDTH_MM, ROOT_THICKNESS_MM = 0.90, 0.45
 #: The flat that grips: the inner faces touch this far back from the tips when closed, mm.
 PLATFORM_MM = 1.0
 #: Distance of the closed blades' inner faces from the middle plane at the axis, mm.

@@ -1,0 +1,41 @@
+"""How a recording opens: the stitch, forces over time, what the hands hold, the log and the scores."""
+
+from __future__ import annotations
+
+import rerun.blueprint as rrb
+
+#: Where the eye is and what it looks at, mm: from above and the near side, as through a microscope.
+EYE_MM = (1.4, -4.4, 3.6)
+LOOK_AT_MM = (0.2, 0.0, 0.45)
+BACKGROUND = (24, 30, 38)
+
+
+def blueprint() -> rrb.Blueprint:
+    """The arrangement that travels inside the recording."""
+    stitch = rrb.Spatial3DView(
+        origin="/world",
+        name="Stitch",
+        background=rrb.Background(color=BACKGROUND),
+        line_grid=rrb.LineGrid3D(visible=False),
+        eye_controls=rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital, position=EYE_MM, look_target=LOOK_AT_MM, eye_up=(0.0, 0.0, 1.0)
+        ),
+    )
+    forces = rrb.TimeSeriesView(origin="/force", name="Force (mN)")
+    closures = rrb.TimeSeriesView(
+        origin="/closure", name="Closure of the jaws", axis_y=rrb.ScalarAxis(range=(0.0, 1.0), zoom_lock=True)
+    )
+    states = rrb.StateTimelineView(origin="/state", name="Step and hands")
+    log = rrb.TextLogView(origin="/events", name="Events")
+    scores = rrb.TextDocumentView(origin="/scores", name="Scores")
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Vertical(stitch, states, row_shares=[4, 1]),
+            rrb.Vertical(forces, rrb.Tabs(scores, closures), log, row_shares=[2, 2, 3]),
+            column_shares=[3, 2],
+        ),
+        rrb.TimePanel(timeline="sim_time", state="collapsed", fps=30.0),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.BlueprintPanel(state="hidden"),
+        auto_views=False,
+    )

@@ -1,0 +1,320 @@
+"""The recording that a person looks at: a rerun file with the scene, forces, events and scores.
+
+World coordinates are mm with +z up, on the timelines ``tick`` and ``sim_time``. The tick hands a copy of the
+scene to a thread, at most ``max_hz`` times a second, and the thread writes it; what was measured belongs
+in the log, not here: vertices are rounded for the eye, and in real time a frame is dropped sooner than the
+simulation waits. Events are never dropped. The trainee's name is not in the file.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import math
+import queue
+import threading
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import rerun as rr
+
+from trainer.events import (
+    Break,
+    Drop,
+    Event,
+    Grasp,
+    Overforce,
+    Release,
+    Slip,
+    StepDone,
+    TaskDone,
+    TaskStarted,
+    Tear,
+    TickOverrun,
+    TrackingLost,
+)
+from trainer.geometry import Array
+from trainer.log.record import Metric, SessionHeader
+from trainer.sinks.blueprint import blueprint
+from trainer.sinks.normals import vertex_normals
+from trainer.sinks.rrd_file import RecordingError, RrdFile
+from trainer.sinks.surface import Frame, Layout, TickRecord
+
+#: Step to which vertices are rounded, mm (0.24 µm). A power of two clears the low bits of a float32, which is
+#: what lets LZ4 shrink them; the step is a twentieth of a pixel where 5 mm fill 1000 pixels.
+VERTEX_STEP_MM = 2.0**-12
+#: Step to which normals are rounded: 0.2 degrees, invisible in shading.
+NORMAL_STEP = 2.0**-8
+#: Frames that may wait for the thread: half a second at 30 Hz.
+FRAMES_WAITING = 15
+
+STEEL = (176, 184, 192, 255)
+NEEDLE = (226, 230, 235, 255)
+THREAD = (58, 130, 246, 255)
+#: A null state: the lane of the state timeline shows a gap.
+EMPTY = pa.array([None], pa.utf8())
+LEVELS: dict[type[Event], str] = {
+    Break: "ERROR",
+    Tear: "ERROR",
+    Slip: "WARN",
+    Drop: "WARN",
+    Overforce: "WARN",
+    TrackingLost: "WARN",
+    TickOverrun: "WARN",
+}
+
+
+@dataclass(frozen=True)
+class _Moment:
+    """What passes from the tick to the thread."""
+
+    tick: int
+    time_s: float
+    events: tuple[Event, ...]
+    frame: Frame | None
+    closure: Array  # (k,)
+
+
+class RecordingSink:
+    """Writes ``path`` (.rrd). Raises RecordingError when the file cannot be made.
+
+    A failure during the session is kept in ``error`` and raised by :meth:`close`; ``tick`` never fails.
+    With ``realtime`` a frame is dropped (and counted in ``dropped_frames``) when the thread is behind;
+    without it the tick waits, so that the same session gives the same recording.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        header: SessionHeader,
+        layout: Layout,
+        tick_hz: float,
+        max_hz: float = 30.0,
+        realtime: bool = True,
+    ) -> None:
+        self.path = Path(path)
+        self.dropped_frames = 0
+        self._failure: RecordingError | None = None
+        self._header = header
+        self._layout = layout
+        self._realtime = realtime
+        self._ticks_per_frame = max(1, math.ceil(tick_hz / max_hz - 1e-9))
+        self._ticks_per_flush = max(1, round(tick_hz))
+        self._next_frame = 0
+        self._next_flush = 0
+        self._last = (0, 0.0)
+        self._steps = [str(step["name"]) for step in tomllib.loads(header.task_toml).get("step", [])]
+
+        # Chunks end where the session's own clock says (see _write), not the machine's: the same session gives
+        # the same chunks, and `rerun rrd compare` finds two recordings equal.
+        self._stream = rr.RecordingStream(
+            "trainer",
+            recording_id=header.id,
+            send_properties=True,
+            batcher_config=rr.ChunkBatcherConfig(flush_tick=datetime.timedelta(days=1)),
+        )
+        self._stream.set_log_time_enabled(False)
+        self._file = RrdFile(self.path, self._stream, blueprint())
+        self._log_header()
+        self._log_layout()
+
+        self._free = threading.Semaphore(FRAMES_WAITING)
+        self._queue: queue.SimpleQueue[_Moment | tuple[Metric, ...] | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
+        self._thread.start()
+
+    @property
+    def error(self) -> RecordingError | None:
+        """Why the recording is incomplete, or None."""
+        return self._failure or self._file.error
+
+    def tick(self, record: TickRecord) -> None:
+        """Take the events, and the frame when one is due; the last tick's frame is always due."""
+        frame = None
+        last = any(isinstance(event, TaskDone) for event in record.events)
+        if record.tick >= self._next_frame or last:
+            self._next_frame = record.tick + self._ticks_per_frame
+            if self._free.acquire(blocking=last or not self._realtime):
+                frame = record.frame()
+            else:
+                self.dropped_frames += 1
+        if frame is not None or record.events:
+            closure = record.poses.closure.copy()
+            self._queue.put(_Moment(record.tick, record.time_s, record.events, frame, closure))
+
+    def metrics(self, metrics: tuple[Metric, ...]) -> None:
+        """The scores, after the last tick: a scalar each, and a document with all of them."""
+        self._queue.put(metrics)
+
+    def close(self) -> None:
+        """Finish the file. Raises RecordingError when it is incomplete."""
+        self._queue.put(None)
+        self._thread.join()
+        self._stream.disconnect()
+        self._file.close()
+        if self.error is not None:
+            raise self.error
+
+    def _run(self) -> None:
+        while (item := self._queue.get()) is not None:
+            try:
+                if self.error is None:
+                    if isinstance(item, _Moment):
+                        self._write(item)
+                    else:
+                        self._log_metrics(item)
+            except Exception as error:  # of whatever kind: the session goes on without its recording
+                self._failure = RecordingError(self.path, error)
+            finally:
+                if isinstance(item, _Moment) and item.frame is not None:
+                    self._free.release()
+
+    def _write(self, moment: _Moment) -> None:
+        if moment.tick >= self._next_flush:
+            # A killed process loses what came after the last flush: at most one second of the session.
+            self._stream.flush()
+            self._next_flush = moment.tick + self._ticks_per_flush
+        for event in moment.events:
+            self._set_time(event.tick, event.time_s)
+            self._log_event(event)
+        self._last = (moment.tick, moment.time_s)
+        if moment.frame is not None:
+            self._set_time(*self._last)
+            self._log_frame(moment.frame)
+            for tool, closure in zip(self._header.tools, moment.closure, strict=True):
+                self._stream.log(f"closure/{tool}", rr.Scalars(closure))
+
+    def _set_time(self, tick: int, time_s: float) -> None:
+        self._stream.set_time("tick", sequence=tick)
+        self._stream.set_time("sim_time", duration=time_s)
+
+    def _log_header(self) -> None:
+        header = self._header
+        started = datetime.datetime.fromisoformat(header.started_at)
+        self._stream.send_recording_name(f"{header.task} {header.started_at}")
+        self._stream.send_recording_start_time_nanos(int(started.timestamp()) * 1_000_000_000)
+        self._stream.send_property(
+            "session",
+            rr.AnyValues(
+                id=header.id,
+                task=header.task,
+                task_sha256=header.task_sha256,
+                device=header.device,
+                device_sha256=header.device_sha256,
+                seed=header.seed,
+                tick_hz=header.tick_hz,
+                units="mm, s, mN",
+                versions=[f"{name} {version}" for name, version in sorted(header.versions.items())],
+            ),
+        )
+
+    def _log_layout(self) -> None:
+        """All that does not change. A static vertex position would shadow every later one: none here."""
+        log = self._stream.log
+        layout = self._layout
+        log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        for surface in layout.surfaces:
+            topology = rr.Mesh3D.from_fields(triangle_indices=surface.triangles, albedo_factor=surface.rgba)
+            log(f"world/{surface.name}", topology, static=True)
+        for part in layout.parts:
+            mesh = rr.Mesh3D(
+                vertex_positions=part.vertices,
+                triangle_indices=part.triangles,
+                vertex_normals=_normals(part.vertices, part.triangles),
+                albedo_factor=STEEL,
+            )
+            log(f"world/instruments/{part.name}", mesh, static=True)
+        if layout.needle is not None:
+            needle = rr.LineStrips3D([layout.needle], radii=layout.needle_radius_mm, colors=NEEDLE)
+            log("world/needle", needle, static=True)
+        thread = rr.LineStrips3D.from_fields(radii=layout.thread_radius_mm, colors=THREAD)
+        log("world/thread", thread, static=True)
+        log("force/tissue", rr.SeriesLines(names="instruments on tissue", colors=(240, 120, 110)), static=True)
+        log("force/thread", rr.SeriesLines(names="tension of the thread", colors=THREAD), static=True)
+        for tool in self._header.tools:
+            log(f"closure/{tool}", rr.SeriesLines(names=tool), static=True)
+
+    def _log_frame(self, frame: Frame) -> None:
+        log = self._stream.log
+        for surface, vertices in zip(self._layout.surfaces, frame.vertices, strict=True):
+            mesh = rr.Mesh3D.from_fields(
+                vertex_positions=_rounded(vertices, VERTEX_STEP_MM),
+                vertex_normals=_rounded(_normals(vertices, surface.triangles), NORMAL_STEP),
+            )
+            log(f"world/{surface.name}", mesh)
+        for k, part in enumerate(self._layout.parts):
+            log(f"world/instruments/{part.name}", _transform(frame.part_position[k], frame.part_quaternion[k]))
+        if frame.needle_position is not None and frame.needle_quaternion is not None:
+            log("world/needle", _transform(frame.needle_position, frame.needle_quaternion))
+        pieces = [_rounded(piece, VERTEX_STEP_MM) for piece in frame.thread]
+        log("world/thread", rr.LineStrips3D.from_fields(strips=pieces))
+        log("force/tissue", rr.Scalars(frame.force_mN))
+        log("force/thread", rr.Scalars(frame.tension_mN))
+
+    def _log_event(self, event: Event) -> None:
+        log = self._stream.log
+        log("events", rr.TextLog(_sentence(event), level=LEVELS.get(type(event), "INFO")))
+        match event:
+            case TaskStarted() if self._steps:
+                log("state/step", rr.StateChange(state=self._steps[0]))
+            case StepDone(index=index) if index + 1 < len(self._steps):
+                log("state/step", rr.StateChange(state=self._steps[index + 1]))
+            case TaskDone(outcome=outcome):
+                log("state/step", rr.StateChange(state=outcome))
+            case Grasp(tool=tool, target=target):
+                log(f"state/{tool}", rr.StateChange(state=target))
+            case Release(tool=tool) | Slip(tool=tool):
+                log(f"state/{tool}", rr.StateChange(state=EMPTY))
+
+    def _log_metrics(self, metrics: tuple[Metric, ...]) -> None:
+        self._set_time(*self._last)
+        for metric in metrics:
+            if metric.value is not None:
+                self._stream.log(f"metrics/{metric.name}", rr.Scalars(metric.value))
+        document = rr.TextDocument(_scores(metrics), media_type=rr.MediaType.MARKDOWN)
+        self._stream.log("scores", document, static=True)
+
+
+def _normals(vertices: Array, triangles: np.ndarray) -> Array:
+    normals = np.zeros_like(vertices)
+    vertex_normals(vertices, triangles, normals)
+    return normals
+
+
+def _rounded(values: Array, step: float) -> np.ndarray:
+    """``values`` as float32 multiples of ``step``, a power of two (exact below 2^24 steps: 4 m for vertices)."""
+    return np.asarray(np.rint(values / step) * step, dtype=np.float32)
+
+
+def _transform(position: Array, quaternion: Array) -> rr.Transform3D:
+    return rr.Transform3D.from_fields(translation=position, quaternion=rr.Quaternion(xyzw=np.roll(quaternion, -1)))
+
+
+def _sentence(event: Event) -> str:
+    """The event in one line: kind, tool, then its own fields."""
+    shared = {field.name for field in dataclasses.fields(Event)}
+    own = [f.name for f in dataclasses.fields(event) if f.name not in shared]
+    values = {name: _short(getattr(event, name)) for name in own}
+    fields = [f"{name}={value}" for name, value in values.items() if value]
+    return " ".join([event.kind, *([event.tool] if event.tool else []), *fields])
+
+
+def _short(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, tuple):
+        return f"({', '.join(map(_short, value))})"
+    return str(value)
+
+
+def _scores(metrics: tuple[Metric, ...]) -> str:
+    """A Markdown table of the metrics with their target bands and sources."""
+    rows = ["| measure | value | unit | target | source |", "|---|---:|---|---|---|"]
+    for m in metrics:
+        value = "–" if m.value is None else f"{m.value:.3g}"
+        bounds = ["" if b is None else f"{b:g}" for b in (m.target_low, m.target_high)]
+        rows.append(f"| {m.name} | {value} | {m.unit} | {' … '.join(bounds) if any(bounds) else ''} | {m.source} |")
+    return "\n".join(rows)
