@@ -1,0 +1,113 @@
+"""``trainer devices``: every shipped profile is listed and in order; a bad one is a line and exit code 1."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from trainer.cli.devices import app
+from trainer.profile import profile_names
+
+REAL = Path(__file__).parents[3] / "shared/data/tracker/WaterTankBottomTranslationTrackerBuffer.igs.mha"
+
+HEADER = "ObjectType = Image\nDimSize = 0 0 3\n"
+FRAMES = "".join(
+    f"Seq_Frame{k:04d}_TipToTrackerTransform = 1 0 0 {k} 0 1 0 0 0 0 1 0 0 0 0 1\n"
+    f"Seq_Frame{k:04d}_FrameNumber = {2 * k}\nSeq_Frame{k:04d}_Timestamp = {k * k / 100}\n"
+    for k in range(3)
+)
+RECORDING = f"{HEADER}{FRAMES}ElementDataFile = LOCAL\n"
+PROFILE = """
+name = "mine"
+driver = "recording"
+summary = "test"
+[recording]
+path = "a.igs.mha"
+[[recording.sensor]]
+name = "Tip"
+tool = "left"
+"""
+
+runner = CliRunner()
+
+
+def test_list_names_every_shipped_profile() -> None:
+    got = runner.invoke(app, ["list", "--json"])
+    assert got.exit_code == 0
+    rows = json.loads(got.stdout)
+    assert [row["name"] for row in rows] == profile_names()
+    assert all(row["summary"] and row["driver"] for row in rows)
+    table = runner.invoke(app, ["list"]).stdout.splitlines()
+    assert [line.split()[0] for line in table] == profile_names()
+
+
+@pytest.mark.parametrize("name", profile_names())
+def test_every_shipped_profile_is_in_order(name: str) -> None:
+    got = runner.invoke(app, ["check", name])
+    assert (got.exit_code, got.stdout) == (0, f"{name}: in order\n")
+
+
+def test_check_says_what_a_recording_holds(tmp_path: Path) -> None:
+    """Three samples 1 mm apart at 0, 10 and 40 ms, every second frame lost: intervals 10 and 30 ms."""
+    path = tmp_path / "a.igs.mha"
+    path.write_text(RECORDING)
+    got = runner.invoke(app, ["check", str(path), "--json"])
+    assert got.exit_code == 0
+    recording = json.loads(got.stdout)["recording"]
+    assert (recording["frames"], recording["gaps"], recording["missing_frames"]) == (3, 2, 2)
+    assert recording["duration_s"] == pytest.approx(0.04)
+    assert recording["interval_median_ms"] == pytest.approx(20.0)
+    assert recording["interval_max_ms"] == pytest.approx(30.0)
+    assert recording["sensors"] == {
+        "Tip": {"frames_ok": 3, "low_mm": [0, 0, 0], "high_mm": [2, 0, 0], "path_length_mm": 2.0}
+    }
+    text = runner.invoke(app, ["check", str(path)]).stdout
+    assert "3 frames, 0.04 s" in text
+    assert "2 gaps, 2 missing frames" in text
+
+
+def test_check_follows_a_profile_to_its_recording(tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_text(PROFILE)
+    (tmp_path / "a.igs.mha").write_text(RECORDING)
+    assert "3 frames" in runner.invoke(app, ["check", str(tmp_path / "mine.toml")]).stdout
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "complaint"),
+    [
+        ("a.igs.mha", HEADER + FRAMES, "the header is cut short"),
+        ("none.igs.mha", "", "no such file"),
+        ("mine.toml", PROFILE.replace("Tip", "Nib"), "no sensor 'Nib'; it has Tip"),
+        ("mine.toml", PROFILE.replace("tool =", "tol ="), "unknown key 'tol', did you mean 'tool'?"),
+        ("mine.toml", PROFILE.replace('"mine"', '"yours"'), "'name' must equal the file's name"),
+        ("mine.toml", PROFILE.replace("a.igs", "b.igs"), "b.igs.mha: no such file"),
+        ("none.db#1", "", "no log here"),
+        ("unknown", "", "unknown device profile"),
+    ],
+)
+@pytest.mark.parametrize("as_json", [False, True])
+def test_a_problem_is_one_line_and_exit_code_1(
+    tmp_path: Path, name: str, content: str, complaint: str, as_json: bool
+) -> None:
+    (tmp_path / "a.igs.mha").write_text(RECORDING)
+    if content:
+        (tmp_path / name).write_text(content)
+    got = runner.invoke(app, ["check", str(tmp_path / name), *(["--json"] if as_json else [])])
+    assert got.exit_code == 1
+    if as_json:
+        (problem,) = json.loads(got.stdout)["problems"]
+    else:
+        assert got.stdout == ""
+        (problem,) = got.stderr.splitlines()
+    assert complaint in problem
+
+
+@pytest.mark.skipif(not REAL.exists(), reason=f"the real recording {REAL.name} is not beside the checkout")
+def test_check_describes_the_real_recording() -> None:
+    got = json.loads(runner.invoke(app, ["check", str(REAL), "--json"]).stdout)
+    assert got["problems"] == []
+    assert (got["recording"]["frames"], got["recording"]["gaps"]) == (5000, 614)
+    assert list(got["recording"]["sensors"]) == ["Probe", "Reference", "Stylus"]
