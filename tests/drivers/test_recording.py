@@ -296,7 +296,7 @@ def test_the_real_recording_is_played_whole(task: Task, home: ToolPoses) -> None
     """Every one of the 614 gaps is one loss and one return, and the Probe's way is its own within 1 %.
 
     Linear interpolation keeps to the straight lines between samples, but a tick beside a sample cuts its corner.
-    1 % is what the recording's users are promised; the noise of the clock's 21 ms on 10 ms ticks costs 0.3 %.
+    1 % is what the recording's users are promised; the ticks of 10 ms on a clock of 21 ms cost 0.3 % here.
     Unit length: the last operation divides by the norm, four roundings of 1.1e-16 each way.
     """
     _, driver = open_driver(str(REAL), task, home, seed=0)
