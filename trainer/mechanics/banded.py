@@ -4,6 +4,10 @@ A matrix whose entries lie within b of the diagonal needs n b² / 2 multiplicati
 (Golub and Van Loan, Matrix Computations, section 4.3). The factor is kept twice, by columns and by rows: both
 substitutions then subtract multiples of contiguous stretches, which the compiler turns into vector instructions
 without being allowed to reorder a sum, so that results are the same bits in every run.
+
+A solve is bound by the memory that it reads. The factor is computed in double precision and kept in single, which
+halves that memory; the arithmetic is double. So a solve is that of a matrix which differs from K by 1e-7 of its
+entries, exactly symmetric and positive definite: a base for iterations that measure their own residual, not an answer.
 """
 
 from __future__ import annotations
@@ -21,8 +25,8 @@ class BandedFactor:
     """L and D of K = L D Lᵀ for the nodes ``order``; the unknown 3 p + c is component c of node ``order[p]``."""
 
     order: np.ndarray  # (f,) int32 nodes, in the order of elimination
-    columns: Array  # (3 f, b) L[j + 1 + k, j]
-    rows: Array  # (3 f, b) L[j, j - b + k]
+    columns: np.ndarray  # (3 f, b) float32, L[j + 1 + k, j]
+    rows: np.ndarray  # (3 f, b) float32, L[j, j - b + k]
     inverse: Array  # (3 f,) 1 / D[j]
 
 
@@ -47,7 +51,7 @@ def assemble_band(blocks: Array, links: np.ndarray, place: np.ndarray, band: Arr
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def factor_band(band: Array, columns: Array, rows: Array, inverse: Array) -> bool:
+def factor_band(band: Array, columns: np.ndarray, rows: np.ndarray, inverse: Array) -> bool:
     """L D Lᵀ of ``band`` (overwritten), L with unit diagonal; False when a pivot is not positive.
 
     ``columns[j, k]`` is L[j + 1 + k, j], ``rows[j, k]`` is L[j, j - b + k], ``inverse[j]`` is 1 / D[j].
@@ -72,7 +76,7 @@ def factor_band(band: Array, columns: Array, rows: Array, inverse: Array) -> boo
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def solve_band(columns: Array, rows: Array, inverse: Array, v: Array) -> None:
+def solve_band(columns: np.ndarray, rows: np.ndarray, inverse: Array, v: Array) -> None:
     """Overwrites ``v`` (3 f,) with K⁻¹ v."""
     n, b = columns.shape
     for j in range(n):
@@ -123,7 +127,7 @@ def factor(blocks: Array, links: np.ndarray, order: np.ndarray, node_count: int)
     b = min(3 * reach + 2, 3 * len(order) - 1)
     band = np.zeros((3 * len(order), b + 1))
     assemble_band(blocks, links, place, band)
-    columns, rows = np.zeros((3 * len(order), b)), np.zeros((3 * len(order), b))
+    columns, rows = np.zeros((2, 3 * len(order), b), dtype=np.float32)
     inverse = np.zeros(3 * len(order))
     if not factor_band(band, columns, rows, inverse):
         raise ValueError("the links do not hold all free nodes in place: the stiffness matrix is singular")
