@@ -55,7 +55,7 @@ class ThreadModel:
 
     def arcs(self) -> Array:
         """Arcs (count,) of the nodes, mm."""
-        return self.needle_length + self.link * np.arange(self.count)
+        return self.needle_length + self.link * np.arange(self.count, dtype=np.float64)
 
     def whole(self) -> Array:
         """The pieces (1, 2) of an unbroken thread."""
@@ -80,9 +80,15 @@ def _constraints(arc: Array, position: Array) -> tuple[Array, Array]:
     p = np.ascontiguousarray(position, dtype=np.float64)
     if p.shape != (len(s), 3):
         raise ValueError(f"{len(s)} constraint arcs need positions of shape ({len(s)}, 3), not {p.shape}")
-    if np.any(s[1:] < s[:-1]):
-        raise ValueError("constraints must come in the order of their arcs")
+    if not (np.isfinite(s).all() and (s[1:] >= s[:-1]).all()):
+        raise ValueError("constraints must come in the order of their arcs, which must be finite")
     return s, p
+
+
+def _nodes(model: ThreadModel, x: Array) -> Array:
+    if x.shape != (model.count, 3):
+        raise ValueError(f"this thread's positions have shape ({model.count}, 3), not {x.shape}")
+    return x
 
 
 def slide(
@@ -123,7 +129,7 @@ def follow(model: ThreadModel, x: Array, constraint_arc: Array, constraint_posit
     arcs, points = _constraints(constraint_arc, constraint_position)
     shortage = np.empty(len(arcs))
     work = np.empty((3, model.count + 1, 3))
-    follow_kernel(x, model.needle_length, model.link, pieces, arcs, points, shortage, work[0], work[1], work[2])
+    follow_kernel(_nodes(model, x), model.needle_length, model.link, pieces, arcs, points, shortage, work[0], work[1], work[2])
     return shortage
 
 
@@ -150,8 +156,8 @@ def _vertices(
 
     ``work`` is working space of the same shape, at least n + 2 c rows.
     """
-    i0 = int(round((s0 - origin) / link))
-    i1 = int(round((s1 - origin) / link))
+    i0 = round((s0 - origin) / link)
+    i1 = round((s1 - origin) / link)
     rows = 0
     k = 0
     while k < len(arcs) and (arcs[k] - origin) / link < i0 - SNAP:
@@ -217,8 +223,9 @@ def _largest_error(v: Array, rows: int, link: float) -> float:
     for i in range(rows - 1):
         dx, dy, dz = v[i + 1, 0] - v[i, 0], v[i + 1, 1] - v[i, 1], v[i + 1, 2] - v[i, 2]
         error = abs(math.sqrt(dx * dx + dy * dy + dz * dz) - (v[i + 1, 3] - v[i, 3])) / link
-        if not error <= worst:  # a NaN must not pass
-            worst = error
+        if math.isnan(error):
+            return math.nan
+        worst = max(worst, error)
     return worst
 
 
@@ -244,7 +251,7 @@ def _polylines(model: ThreadModel, x: Array, arc: Array, position: Array, pieces
     found = []
     for s0, s1 in pieces:
         v, work = np.empty((2, model.count + 2 * len(arcs) + 1, 5))
-        rows = _vertices(x, model.needle_length, model.link, s0, s1, arcs, points, work, v)
+        rows = _vertices(_nodes(model, x), model.needle_length, model.link, s0, s1, arcs, points, work, v)
         found.append(v[:rows])
     return found
 
@@ -259,9 +266,9 @@ def polyline(
 def length_error(
     model: ThreadModel, x: Array, constraint_arc: Array, constraint_position: Array, pieces: Array
 ) -> float:
-    """The largest |distance - arc| between neighbours of the polyline, in link lengths; 0 is exact."""
+    """The largest |distance - arc| between neighbours of the polyline, in link lengths; 0 is exact, NaN shows."""
     lines = _polylines(model, x, constraint_arc, constraint_position, pieces)
-    return max((float(_largest_error(v, len(v), model.link)) for v in lines), default=0.0)
+    return float(np.max([_largest_error(v, len(v), model.link) for v in lines], initial=0.0))
 
 
 def closest(

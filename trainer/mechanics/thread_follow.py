@@ -273,21 +273,21 @@ def follow_kernel(
     """``thread.follow`` on plain arrays: each piece from constraint to constraint, then out to its free ends."""
     shortage[:] = 0.0
     for p in range(pieces.shape[0]):
-        i0 = int(round((pieces[p, 0] - origin) / link))
-        i1 = int(round((pieces[p, 1] - origin) / link))
+        i0 = round((pieces[p, 0] - origin) / link)
+        i1 = round((pieces[p, 1] - origin) / link)
         previous = -1
         t_previous = 0.0
         for k in range(arcs.shape[0]):
             t = (arcs[k] - origin) / link
             if t < i0 - SNAP or t > i1 + SNAP:
                 continue
-            stop = int(math.ceil(t - SNAP))
+            stop = math.ceil(t - SNAP)
             if previous < 0:
                 one_sided(
                     x, stop - 1, i0 - 1, -1, points[k, 0], points[k, 1], points[k, 2], (t - stop + 1) * link, link, x
                 )
             else:
-                start = int(math.floor(t_previous + SNAP)) + 1
+                start = math.floor(t_previous + SNAP) + 1
                 if stop > start:
                     shortage[previous] = follow_between(
                         x, start, stop, (start - t_previous) * link, link, (t - stop + 1) * link, points, points,
@@ -303,7 +303,7 @@ def follow_kernel(
             previous = k
             t_previous = t
         if previous >= 0:
-            start = int(math.floor(t_previous + SNAP)) + 1
+            start = math.floor(t_previous + SNAP) + 1
             one_sided(
                 x, start, i1 + 1, 1, points[previous, 0], points[previous, 1], points[previous, 2],
                 (start - t_previous) * link, link, x,

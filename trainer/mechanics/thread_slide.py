@@ -14,7 +14,9 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from trainer.geometry import Array
 
@@ -53,7 +55,8 @@ def pool(y: Array, begin: int, end: int, upper: int, values: Array, first: Array
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def slide_piece(
-    arcs: Array, points: Array, hard: Array, begin: int, end: int, tolerance: float, shortage: Array, work: Array
+    arcs: Array, points: Array, hard: NDArray[np.bool_], begin: int, end: int, tolerance: float, shortage: Array,
+    work: Array,
 ) -> None:
     """Slide the soft ones of constraints ``begin`` .. ``end - 1``, which lie on one piece, in place."""
     travelled, y, out, values, first = work[0], work[1], work[2], work[3], work[4]
@@ -101,8 +104,8 @@ def slide_piece(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def slide_kernel(
-    arcs: Array, points: Array, hard: Array, pieces: Array, tolerance: float, old: Array, shortage: Array,
-    pulled_out: Array, work: Array,
+    arcs: Array, points: Array, hard: NDArray[np.bool_], pieces: Array, tolerance: float, old: Array, shortage: Array,
+    pulled_out: NDArray[np.bool_], work: Array,
 ) -> None:
     """``thread.slide`` on plain arrays; ``arcs`` is changed in place, ``old`` holds its first values.
 
