@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import secrets
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -21,6 +21,8 @@ from sqlite_utils.db import Table
 
 #: A session whose writer has been silent for so long is taken for dead (the writer beats every second).
 STALE_S = 30.0
+
+_DAMAGED = "damaged; restore a copy made by `trainer db backup`"
 
 migrations = Migrations("trainer")
 
@@ -108,14 +110,7 @@ def create_log(path: Path) -> Database:
         if path.exists() and path.stat().st_size > 0:
             return open_log(path)
         path.parent.mkdir(parents=True, exist_ok=True)
-        db = _connect(path)
-        try:
-            db.enable_wal()
-            migrations.apply(db)
-        except BaseException:
-            db.close()
-            raise
-    return db
+        return _connected(path, _make_tables)
 
 
 def open_log(path: Path) -> Database:
@@ -126,21 +121,14 @@ def open_log(path: Path) -> Database:
     if not path.is_file():
         raise LogError(f"{path}: no log here; `trainer practice` makes one, --db or TRAINER_DB names another")
     with clear_errors(path):
-        db = _connect(path)
-        try:
-            _check_version(db, path)
-        except BaseException:
-            db.close()
-            raise
-    return db
+        return _connected(path, _check_version)
 
 
 def migrate(path: Path) -> list[str]:
     """Bring the tables of the log at ``path`` up to date; the names of the steps taken. Raises LogError."""
     if not path.is_file():
         raise LogError(f"{path}: no log here, nothing to migrate")
-    with clear_errors(path), _connect(path) as db:
-        _check_own(db, path)
+    with clear_errors(path), _connected(path, _check_own) as db:
         steps = [m.name for m in migrations.pending(db)]
         migrations.apply(db)
     return steps
@@ -153,13 +141,15 @@ def clear_errors(path: Path) -> Iterator[None]:
         yield
     except sqlite3.Error as error:
         raise LogError(f"{path}: {_reason(error)}") from error
+    except UnicodeDecodeError as error:  # Python's driver, where a damaged file gave SQLite's message its words
+        raise LogError(f"{path}: {_DAMAGED}") from error
     except OSError as error:
         raise LogError(f"{path}: {error.strerror}") from error
 
 
 def path_of(db: Database) -> Path:
     """The file behind a connection."""
-    return Path(next(row["file"] for row in db.query("select file from pragma_database_list where name = 'main'")))
+    return Path(os.fsdecode(db.conn.execute("pragma database_list").fetchone()[2]))
 
 
 def _reason(error: sqlite3.Error) -> str:
@@ -171,28 +161,43 @@ def _reason(error: sqlite3.Error) -> str:
     if name.startswith("SQLITE_NOTADB"):
         return "not a log: not an SQLite file"
     if name.startswith("SQLITE_CORRUPT"):
-        return f"damaged ({error}); restore a copy made by `trainer db backup`"
+        return f"{_DAMAGED} ({error})"
     return str(error)
 
 
-def _connect(path: Path) -> Database:
+def _connected(path: Path, prepare: Callable[[Database], None]) -> Database:
+    """A connection on which ``prepare`` has done its work; closed again where that fails."""
     db = Database(path)
-    db.conn.execute("pragma foreign_keys = on")
-    db.conn.execute("pragma synchronous = normal")
+    try:
+        db.conn.execute("pragma foreign_keys = on")
+        db.conn.execute("pragma synchronous = normal")
+        prepare(db)
+    except BaseException:
+        db.close()
+        raise
     return db
 
 
-def _check_own(db: Database, path: Path) -> None:
+def _make_tables(db: Database) -> None:
+    db.enable_wal()
+    migrations.apply(db)
+
+
+def _check_own(db: Database) -> None:
     """Raises LogError for somebody else's database and for tables that a newer program made."""
     known = {m.name for m in migrations._migrations}
     applied = {m.name for m in migrations.applied(db)}
     if not applied:
-        raise LogError(f"{path}: not a log: an SQLite file of another program")
+        raise LogError(f"{path_of(db)}: not a log: an SQLite file of another program")
     if applied - known:
-        raise LogError(f"{path}: written by a newer version of this program; update it with `pip install -U trainer`")
+        raise LogError(
+            f"{path_of(db)}: written by a newer version of this program; update it with `pip install -U trainer`"
+        )
 
 
-def _check_version(db: Database, path: Path) -> None:
-    _check_own(db, path)
+def _check_version(db: Database) -> None:
+    _check_own(db)
     if migrations.pending(db):
-        raise LogError(f"{path}: written by an older version; run `trainer db backup COPY`, then `trainer db migrate`")
+        raise LogError(
+            f"{path_of(db)}: written by an older version; run `trainer db backup COPY`, then `trainer db migrate`"
+        )

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 
 from sqlite_utils import Database
 
-from trainer.log.schema import path_of, table
+from trainer.log.schema import LogError, clear_errors, path_of, table
 
 #: The sealed columns and their order. A later column joins under a new name of the format, so that old seals hold.
 SEALED = {
@@ -63,13 +63,14 @@ def digest(connection: sqlite3.Connection, session_id: str | bytes) -> str:
 
 def check(db: Database) -> list[str]:
     """What is wrong with a log: lines that name the sessions whose rows are not those that were sealed."""
-    connection = db.conn
+    connection, path = db.conn, path_of(db)
     with _stored_bytes(connection):
         try:
-            problems = [f"{path_of(db)}: {line}" for line in _damage(connection)]
-            return [*problems, *_orphans(connection), *_changed(connection), *_broken_chains(connection)]
-        except sqlite3.DatabaseError as error:
-            return [f"{path_of(db)}: damaged ({error}); restore a copy made by `trainer db backup`"]
+            with clear_errors(path):
+                problems = [f"{path}: {line}" for line in _damage(connection)]
+                return [*problems, *_orphans(connection), *_changed(connection), *_broken_chains(connection)]
+        except LogError as error:
+            return [str(error)]
 
 
 @contextmanager
@@ -115,7 +116,7 @@ def _changed(connection: sqlite3.Connection) -> Iterator[str]:
             continue
         try:
             changed = digest(connection, session).encode() != stored
-        except sqlite3.DatabaseError as error:
+        except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
             yield f"{_name(session)}: cannot be read ({error})"
             continue
         if changed:
