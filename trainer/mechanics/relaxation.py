@@ -1,0 +1,151 @@
+"""The quasi-static relaxation of Brown et al. 2001, section 3, as published.
+
+Equation (2), Σ F_ij + external force = 0 at every variable node, is solved by sweeps: each node in turn moves along
+the force on it, x_i ← x_i + α f_i. The nodes are visited breadth first from those that the user has moved, so that a
+force travels through the whole mesh within a sweep; a sweep may be limited to the nodes within a number of links of
+the moved ones, and may stop spreading where forces fall below a threshold.
+
+The paper chooses one α by trial. A fixed one that suits a mesh of 2000 nodes diverges at 300 and at 20 000; here
+α_i = 1 / Σ_j k_ij over the node's links, the reciprocal of the trace of its stiffness block and so at most half of
+the largest α at which the node's own iteration converges.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from trainer.geometry import Array
+from trainer.mechanics.links import LinkMesh
+
+#: Sweeps between two looks at the residual and the time.
+SWEEPS_PER_LOOK = 10
+
+
+@dataclass(frozen=True)
+class Relaxation:
+    """How a relaxation ended."""
+
+    converged: bool
+    sweeps: int
+    residual_mN: float  # Euclidean norm of the forces on the nodes that the sweeps visit
+
+
+def breadth_first(mesh: LinkMesh, moved: np.ndarray, most_links: int | None = None) -> np.ndarray:
+    """The variable nodes (r,) int32 by their distance in links from the nodes ``moved`` (k,), nearest first.
+
+    Moved and fixed nodes are not in it; nor are nodes further away than ``most_links``, where that is given.
+    """
+    distance = np.full(len(mesh.rest), -1, dtype=np.int64)
+    distance[moved] = 0
+    frontier = [int(i) for i in moved]
+    order: list[int] = []
+    while frontier and (most_links is None or distance[frontier[0]] < most_links):
+        reached = []
+        for i in frontier:
+            for j in mesh.neighbour[mesh.start[i] : mesh.start[i + 1]]:
+                if distance[j] < 0:
+                    distance[j] = distance[i] + 1
+                    reached.append(int(j))
+        order += [j for j in reached if not mesh.fixed[j]]
+        frontier = reached
+    return np.array(order, dtype=np.int32)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def sweep(
+    x: Array,
+    order: np.ndarray,
+    start: np.ndarray,
+    neighbour: np.ndarray,
+    via: np.ndarray,
+    rest_length: Array,
+    stiffness: Array,
+    load: Array,
+    cut_off_mN: float,
+    reached: np.ndarray,
+) -> float:
+    """One Gauss–Seidel sweep over ``order``; returns the Euclidean norm of the forces that it met, mN.
+
+    ``reached`` (n,) bool says which nodes a force has come to; a node passes it on when the force on it is at least
+    ``cut_off_mN``, and is left alone before.
+    """
+    total = 0.0
+    for i in order:
+        if not reached[i]:
+            continue
+        fx, fy, fz = load[i, 0], load[i, 1], load[i, 2]
+        trace = 0.0
+        for entry in range(start[i], start[i + 1]):
+            j, e = neighbour[entry], via[entry]
+            dx, dy, dz = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
+            length = math.sqrt(dx * dx + dy * dy + dz * dz)
+            trace += stiffness[e]
+            if length > 0.0:
+                pull = stiffness[e] * (length - rest_length[e]) / length
+                fx += pull * dx
+                fy += pull * dy
+                fz += pull * dz
+        squared = fx * fx + fy * fy + fz * fz
+        total += squared
+        if squared < cut_off_mN * cut_off_mN:
+            continue
+        x[i, 0] += fx / trace
+        x[i, 1] += fy / trace
+        x[i, 2] += fz / trace
+        for entry in range(start[i], start[i + 1]):
+            reached[neighbour[entry]] = True
+    return math.sqrt(total)
+
+
+def relax(
+    mesh: LinkMesh,
+    x: Array,
+    moved: np.ndarray,
+    *,
+    tolerance_mN: float,
+    most_sweeps: int,
+    load: Array | None = None,
+    most_links: int | None = None,
+    cut_off_mN: float = 0.0,
+    out_of_time: Callable[[], bool] = lambda: False,
+) -> Relaxation:
+    """Moves the variable nodes of ``x`` (n, 3), in place, towards equilibrium with the nodes ``moved`` (k,) where they are.
+
+    ``load`` (n, 3) mN is the external force on each node: gravity m_i g, a push. ``most_links`` and ``cut_off_mN``
+    limit the region as in the paper. Ends when the residual is small enough, after ``most_sweeps``, or when
+    ``out_of_time`` says so (the paper gives it 1/30 s); it is asked every few sweeps.
+    """
+    order = breadth_first(mesh, moved, most_links)
+    load = np.zeros_like(x) if load is None else load
+    reached = np.any(load != 0.0, axis=1)
+    for i in moved:
+        reached[mesh.neighbour[mesh.start[i] : mesh.start[i + 1]]] = True
+    if cut_off_mN == 0.0:
+        reached[:] = True
+    residual = math.inf
+    done = 0
+    while done < most_sweeps and not out_of_time():
+        for _ in range(min(SWEEPS_PER_LOOK, most_sweeps - done)):
+            residual = float(
+                sweep(
+                    x,
+                    order,
+                    mesh.start,
+                    mesh.neighbour,
+                    mesh.via,
+                    mesh.rest_length,
+                    mesh.stiffness,
+                    load,
+                    cut_off_mN,
+                    reached,
+                )
+            )
+            done += 1
+        if residual <= tolerance_mN:
+            return Relaxation(True, done, residual)
+    return Relaxation(False, done, residual)
