@@ -5,8 +5,8 @@ from __future__ import annotations
 import rerun.blueprint as rrb
 
 #: Where the eye is and what it looks at, mm: from above and the near side, as through a microscope.
-EYE_MM = (1.4, -4.4, 3.6)
-LOOK_AT_MM = (0.2, 0.0, 0.45)
+EYE_MM = (1.4, -4.8, 3.9)
+LOOK_AT_MM = (0.15, 0.0, 0.75)
 BACKGROUND = (24, 30, 38)
 
 
@@ -26,7 +26,9 @@ def blueprint() -> rrb.Blueprint:
         origin="/closure", name="Closure of the jaws", axis_y=rrb.ScalarAxis(range=(0.0, 1.0), zoom_lock=True)
     )
     states = rrb.StateTimelineView(origin="/state", name="Step and hands")
-    log = rrb.TextLogView(origin="/events", name="Events")
+    log = rrb.TextLogView(
+        origin="/events", name="Events", columns=rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"])
+    )
     scores = rrb.TextDocumentView(origin="/scores", name="Scores")
     return rrb.Blueprint(
         rrb.Horizontal(
