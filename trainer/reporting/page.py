@@ -1,0 +1,269 @@
+"""Reports as one HTML file each: no script, nothing fetched, figures inline, fit for A4 paper.
+
+The text around the figures lives in ``reports/templates``; every name that came from a person or a log is
+escaped on its way into it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from html import escape
+from itertools import groupby
+from string import Template
+
+from trainer.config import read_text
+from trainer.data_files import data_folder
+from trainer.reporting import figures, wording
+from trainer.reporting.progress import Attempt, Curve, ProgressReport, ProgressRow, TaskProgress
+from trainer.reporting.session import EventLine, MetricRow, SessionReport, StitchMap
+
+MAP_CAPTION = (
+    "Each vessel end around its cut edge, 3 o'clock on the same side of both. Distance from the inner circle is the "
+    "bite in mm; the number is the pass; dashed dots were left again."
+)
+
+
+class Sources:
+    """The sources of the targets, numbered in the order in which they are first cited."""
+
+    def __init__(self) -> None:
+        self.listed: list[str] = []
+
+    def cite(self, row: MetricRow) -> str:
+        """The reference to a row's source, as a superscript."""
+        if not row.source:
+            return ""
+        if row.source not in self.listed:
+            self.listed.append(row.source)
+        number = self.listed.index(row.source) + 1
+        return f'<sup><a href="#source-{number}">{number}</a></sup>'
+
+    def footnotes(self) -> str:
+        items = [f'<li id="source-{i}">{escape(s)}</li>' for i, s in enumerate(self.listed, 1)]
+        return f"<p>Where the targets come from:</p><ol>{''.join(items)}</ol>" if items else ""
+
+
+def session_page(report: SessionReport) -> str:
+    """The report of one session. Raises ConfigError when a template is missing."""
+    sources = Sources()
+    targets = _target_table(report.targets, sources)
+    return _fill(
+        "session.html",
+        page_title=escape(f"{report.task_title}, {report.trainee}"),
+        style=_template("style.css").template,
+        task_title=escape(report.task_title),
+        outcome=escape(report.outcome),
+        steps=f"{report.steps_done} of {report.steps} steps",
+        facts=_facts(
+            ("Trainee", report.trainee),
+            ("Date", wording.date(report.started_at)),
+            ("Duration", wording.duration(report.duration_s)),
+            ("Device", report.device),
+            ("Task", report.task),
+            ("Session", report.session),
+        ),
+        summary=escape(session_summary(report)),
+        stitch_map=figures.stitch_map(report.stitch_map),
+        map_caption=escape(MAP_CAPTION + _stitch_words(report.stitch_map)),
+        histogram=figures.angle_histogram(report.histogram),
+        histogram_caption=escape(_passes(sum(report.histogram.counts)) + ", in bins of 5°."),
+        targets=targets,
+        others=_other_groups(report.others),
+        events=_event_table(report.events),
+        footer=sources.footnotes() + _definitions(report.targets) + _closing(report.versions, report.overruns),
+    )
+
+
+def progress_page(report: ProgressReport) -> str:
+    """The report of a trainee's progress. Raises ConfigError when a template is missing."""
+    sources = Sources()
+    tasks = "".join(_task_section(t, sources) for t in report.tasks)
+    attempts = sum(len(t.attempts) for t in report.tasks)
+    first, last = (wording.date(t).partition(",")[0] for t in (report.first_at, report.last_at))
+    return _fill(
+        "progress.html",
+        page_title=escape(f"Progress of {report.trainee}"),
+        style=_template("style.css").template,
+        trainee=escape(report.trainee),
+        count=f"{attempts} session{'s' if attempts != 1 else ''}",
+        period=first if first == last else f"{first} to {last}",
+        tasks=tasks,
+        footer=sources.footnotes() + _closing({}, 0),
+    )
+
+
+def session_summary(report: SessionReport) -> str:
+    """How many targets were met, and which were missed."""
+    measured = sum(row.met is not None for row in report.targets)
+    first = f"{report.met} of {len(report.targets)} targets met"
+    first += "." if measured == len(report.targets) else f"; {len(report.targets) - measured} could not be measured."
+    missed = [
+        f"{r.title.lower()} {wording.quantity(r.value, r.unit)} ({wording.band(r.target_low, r.target_high, r.unit)})"
+        for r in report.missed
+    ]
+    return f"{first} Outside: {', '.join(missed)}." if missed else first
+
+
+def task_summary(task: TaskProgress) -> str:
+    """Attempts and how the last one stands against the targets."""
+    rows = [r.last for r in task.rows if r.last.has_target]
+    met = sum(r.met is True for r in rows)
+    tried = f"{len(task.attempts)} attempt{'s' if len(task.attempts) != 1 else ''}, {task.completed} completed."
+    return f"{tried} The last one met {met} of {len(rows)} targets."
+
+
+def curve_words(curve: Curve) -> str:
+    """What the attempts so far can tell."""
+    if curve.recent is None:
+        return "No completed attempt."
+    said = f"Median of the last {min(3, len(curve.values))}: {wording.quantity(curve.recent, curve.unit)}."
+    if curve.trend is None:
+        return said + " Three completed attempts are needed for a slope."
+    unit = wording.unit_word(curve.unit)
+    gap = "" if unit == "°" else " "
+    t = curve.trend
+    return said + f" Slope {t.slope:+.1f}{gap}{unit} per attempt (95 %: {t.low:+.1f} to {t.high:+.1f})."
+
+
+def _template(name: str) -> Template:
+    return Template(read_text(data_folder("reports") / "templates" / name))
+
+
+def _fill(name: str, **parts: str) -> str:
+    return _template(name).substitute(parts)
+
+
+def _facts(*pairs: tuple[str, str]) -> str:
+    return "".join(f"<div><dt>{escape(k)}</dt><dd>{escape(v)}</dd></div>" for k, v in pairs)
+
+
+def _table(head: Sequence[tuple[str, str]], rows: Iterable[Sequence[str]], style: str = "") -> str:
+    """A table; ``head`` holds each column's heading and class. Cells are HTML already."""
+
+    def cell(tag: str, kind: str, content: str) -> str:
+        return f'<{tag} class="{kind}">{content}</{tag}>' if kind else f"<{tag}>{content}</{tag}>"
+
+    top = "".join(cell("th", kind, escape(name)) for name, kind in head)
+    kinds = [kind for _, kind in head]
+    body = "".join(
+        f"<tr>{''.join(cell('td', k, c) for k, c in zip(kinds, row, strict=True))}</tr>" for row in rows
+    )
+    thead = f"<thead><tr>{top}</tr></thead>" if any(name for name, _ in head) else ""
+    return f'<table class="{style}">{thead}<tbody>{body}</tbody></table>'
+
+
+def _verdict(row: MetricRow) -> str:
+    if row.met is None:
+        return '<span class="quiet">not measured</span>'
+    return '<span class="met">met</span>' if row.met else '<span class="missed">missed</span>'
+
+
+def _target_table(rows: tuple[MetricRow, ...], sources: Sources) -> str:
+    head = (("Measure", ""), ("Value", "n"), ("", ""), ("Target", ""), ("", ""))
+    return _table(head, ([_named(r), _value(r), figures.strip(r), _target(r, sources), _verdict(r)] for r in rows))
+
+
+def _named(row: MetricRow) -> str:
+    return f'<span title="{escape(row.meaning)}">{escape(row.title)}</span>'
+
+
+def _value(row: MetricRow) -> str:
+    return f"<strong>{escape(wording.quantity(row.value, row.unit))}</strong>"
+
+
+def _target(row: MetricRow, sources: Sources) -> str:
+    assumed = ' <span class="quiet">assumed</span>' if row.assumed else ""
+    return escape(wording.band(row.target_low, row.target_high, row.unit)) + assumed + sources.cite(row)
+
+
+def _other_groups(rows: tuple[MetricRow, ...]) -> str:
+    order = {"Needle": 0, "Stitch": 1, "Motion": 2, "Handling": 3}
+    parts = []
+    for family, group in groupby(sorted(rows, key=lambda r: order.get(r.family, 9)), key=lambda r: r.family):
+        cells = ([_named(r), escape(wording.quantity(r.value, r.unit))] for r in group)
+        parts.append(f'<div class="group"><h3>{escape(family)}</h3>{_table((("", ""), ("", "n")), cells)}</div>')
+    return "".join(parts)
+
+
+def _event_table(lines: tuple[EventLine, ...]) -> str:
+    head = (("Time", "n"), ("Hand", ""), ("Event", ""), ("", ""))
+    rows = (
+        [
+            f"{e.time_s:.2f} s",
+            escape(e.tool),
+            escape(wording.kind_word(e.kind)),
+            escape(e.text) + (f' <span class="quiet">× {e.count}</span>' if e.count > 1 else ""),
+        ]
+        for e in lines
+    )
+    return _table(head, rows, "events")
+
+
+def _stitch_words(shown: StitchMap) -> str:
+    return " A line joins the two bites of a stitch: level is straight." if len(shown.vessels) > 1 else ""
+
+
+def _passes(count: int) -> str:
+    return f"{count} pass{'es' if count != 1 else ''} of the needle"
+
+
+def _definitions(rows: tuple[MetricRow, ...]) -> str:
+    said = " ".join(f"<strong>{escape(r.title)}</strong>: {escape(r.meaning)}" for r in rows)
+    return f"<p>{said}</p>"
+
+
+def _closing(versions: dict[str, str], overruns: int) -> str:
+    by = f" Scored from the log; recorded by trainer {escape(versions['trainer'])}." if "trainer" in versions else ""
+    late = f" {overruns} ticks took longer than their slot." if overruns else ""
+    assumed = " A target marked “assumed” is a design choice that nobody has measured."
+    return f"<p><strong>{wording.DISCLAIMER}</strong>{assumed}{by}{late}</p>"
+
+
+def _task_section(task: TaskProgress, sources: Sources) -> str:
+    curves = "".join(
+        f"<figure><strong>{escape(c.title)}</strong> <span class='quiet'>{escape(wording.unit_word(c.unit))}</span>"
+        f"{figures.learning_curve(c, len(task.attempts))}<figcaption>{escape(curve_words(c))}</figcaption></figure>"
+        for c in task.curves
+    )
+    sessions = f"the last {task.map_sessions} sessions" if task.map_sessions > 1 else "the last session"
+    return _fill(
+        "task.html",
+        task_title=escape(task.title),
+        summary=escape(task_summary(task)),
+        curves=curves,
+        rows=_progress_table(task.rows, sources),
+        stitch_map=figures.stitch_map(task.stitch_map),
+        map_caption=escape(f"From {sessions}. {MAP_CAPTION}{_stitch_words(task.stitch_map)}"),
+        histogram=figures.angle_histogram(task.histogram),
+        histogram_caption=escape(f"{_passes(sum(task.histogram.counts))} in all sessions, in bins of 5°."),
+        attempts=_attempt_table(task.attempts, task.curves),
+    )
+
+
+def _progress_table(rows: tuple[ProgressRow, ...], sources: Sources) -> str:
+    head = (("Measure", ""), ("Last", "n"), ("Best", "n"), ("Last and five before", ""), ("Target", ""), ("", ""))
+
+    def cells(row: ProgressRow) -> list[str]:
+        attempt = f' <span class="quiet">#{row.best_attempt}</span>' if row.best_attempt is not None else ""
+        best = escape(wording.quantity(row.best, row.last.unit)) + attempt
+        shown = row.last.has_target
+        strip = figures.strip(row.last, row.earlier) if shown else ""
+        target = _target(row.last, sources) if shown else '<span class="quiet">no target</span>'
+        return [_named(row.last), _value(row.last), best, strip, target, _verdict(row.last) if shown else ""]
+
+    return _table(head, map(cells, rows))
+
+
+def _attempt_table(attempts: tuple[Attempt, ...], curves: tuple[Curve, ...]) -> str:
+    head = (("#", "n"), ("Date", ""), ("Outcome", ""), *((c.title, "n") for c in curves), ("Session", ""))
+    rows = (
+        [
+            str(a.number),
+            escape(wording.date(a.started_at)),
+            escape(a.outcome),
+            *(escape(wording.quantity(a.values.get(c.name), c.unit)) for c in curves),
+            f'<span class="quiet">{escape(a.session)}</span>',
+        ]
+        for a in reversed(attempts)
+    )
+    return _table(head, rows, "events")

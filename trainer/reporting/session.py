@@ -1,0 +1,219 @@
+"""What a report of one session shows, as plain data; how it looks is decided elsewhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import groupby
+
+from trainer.curriculum import Task
+from trainer.events import Event, Pierce, TickOverrun
+from trainer.log.record import Metric, SessionRecord
+from trainer.metrics import FAMILIES, definition_of, score
+from trainer.metrics.performance import Performance
+from trainer.metrics.piercing import crossing_angle_deg
+from trainer.metrics.registry import NO_TARGET
+from trainer.reporting import wording
+
+#: Width of a bin of the angle histogram, degrees.
+BIN_DEG = 5
+
+
+@dataclass(frozen=True)
+class MetricRow:
+    """One measured value for a reader."""
+
+    name: str
+    title: str
+    family: str  # heading under which it stands
+    meaning: str
+    value: float | None
+    unit: str
+    target_low: float | None
+    target_high: float | None
+    source: str
+    version: str
+
+    @property
+    def has_target(self) -> bool:
+        return self.target_low is not None or self.target_high is not None
+
+    @property
+    def assumed(self) -> bool:
+        """Whether nobody measured the target."""
+        return self.has_target and self.source.startswith("assumed")
+
+    @property
+    def met(self) -> bool | None:
+        """Whether the value lies in the target band; None without value or target."""
+        if self.value is None or not self.has_target:
+            return None
+        return (self.target_low is None or self.value >= self.target_low) and (
+            self.target_high is None or self.value <= self.target_high
+        )
+
+
+@dataclass(frozen=True)
+class Bite:
+    """One hole in an outer wall, as a dot on a clock face."""
+
+    vessel: str
+    clock_deg: float
+    bite_mm: float
+    angle_error_deg: float | None  # 90 - angle to the wall
+    pass_number: int
+    kept: bool  # still holds needle or thread
+
+
+@dataclass(frozen=True)
+class Mark:
+    """Where a step asks for a hole."""
+
+    vessel: str
+    clock_deg: float
+    bite_mm: float
+
+
+@dataclass(frozen=True)
+class StitchMap:
+    """The holes of a session (or several) around each vessel's cut edge."""
+
+    vessels: tuple[str, ...]
+    bites: tuple[Bite, ...]
+    marks: tuple[Mark, ...]
+    stitches: tuple[tuple[Bite, Bite], ...]
+
+
+@dataclass(frozen=True)
+class Histogram:
+    """Entry angles in bins of 5 degrees from 0 to 90; the last bin includes 90."""
+
+    counts: tuple[int, ...]
+    target_low: float | None
+    target_high: float | None
+
+
+@dataclass(frozen=True)
+class EventLine:
+    """An event, or several alike in a row."""
+
+    time_s: float
+    tool: str
+    kind: str
+    text: str
+    count: int
+
+
+@dataclass(frozen=True)
+class SessionReport:
+    """All that the report of one session shows."""
+
+    session: str
+    trainee: str
+    task: str
+    task_title: str
+    started_at: str
+    device: str
+    status: str
+    outcome: str
+    duration_s: float
+    versions: dict[str, str]
+    steps_done: int
+    steps: int
+    targets: tuple[MetricRow, ...]  # metrics with a target, in the task's order
+    others: tuple[MetricRow, ...]
+    stitch_map: StitchMap
+    histogram: Histogram
+    events: tuple[EventLine, ...]
+    overruns: int  # ticks that took longer than their slot
+
+    @property
+    def met(self) -> int:
+        return sum(row.met is True for row in self.targets)
+
+    @property
+    def missed(self) -> tuple[MetricRow, ...]:
+        return tuple(row for row in self.targets if row.met is False)
+
+
+def session_report(record: SessionRecord, task: Task) -> SessionReport:
+    """The report of a session; scores are computed anew from its record. Raises ConfigError."""
+    performance = Performance(record, task)
+    rows = [metric_row(m, task) for m in score(record, task)]
+    header = record.header
+    return SessionReport(
+        session=header.id,
+        trainee=header.trainee,
+        task=header.task,
+        task_title=task.title,
+        started_at=header.started_at,
+        device=header.device,
+        status=record.status,
+        outcome=record.outcome or record.status,
+        duration_s=record.duration_s,
+        versions=header.versions,
+        steps_done=sum(e.kind == "step_done" for e in record.events),
+        steps=len(task.step),
+        targets=tuple(r for r in rows if r.has_target),
+        others=tuple(r for r in rows if not r.has_target),
+        stitch_map=stitch_map(performance),
+        histogram=histogram([performance], task),
+        events=event_lines(record.events),
+        overruns=sum(isinstance(e, TickOverrun) for e in record.events),
+    )
+
+
+def metric_row(metric: Metric, task: Task) -> MetricRow:
+    """A metric with what its definition says. Raises ConfigError for an unknown one."""
+    definition = definition_of(metric.name, task)
+    family = next(title for module, title in FAMILIES.items() if module.__name__ == definition.measure.__module__)
+    return MetricRow(
+        name=metric.name,
+        title=wording.title(metric.name),
+        family=family,
+        meaning=definition.meaning,
+        value=metric.value,
+        unit=metric.unit,
+        target_low=metric.target_low,
+        target_high=metric.target_high,
+        source=metric.source if metric.source != NO_TARGET else "",
+        version=metric.version,
+    )
+
+
+def stitch_map(performance: Performance) -> StitchMap:
+    """Where the outer walls were pierced, where they should have been, and which holes make a stitch."""
+
+    def bite(p: Pierce) -> Bite:
+        angle = crossing_angle_deg(p)
+        error = None if angle is None else 90.0 - angle
+        return Bite(p.body, p.clock_deg % 360.0, p.axial_mm, error, p.pass_number, performance.is_kept(p))
+
+    marks = {Mark(s.vessel, s.clock_deg, s.bite_mm): None for s in performance.task.step if s.kind == "drive"}
+    return StitchMap(
+        vessels=tuple(performance.vessels),
+        bites=tuple(bite(p) for p in performance.outer_crossings),
+        marks=tuple(marks),
+        stitches=tuple((bite(s.entry), bite(s.exit)) for s in performance.stitches),
+    )
+
+
+def histogram(performances: list[Performance], task: Task) -> Histogram:
+    """The entry angles of all passes of some performances of one task."""
+    counts = [0] * (90 // BIN_DEG)
+    for performance in performances:
+        for p in performance.entries:
+            angle = crossing_angle_deg(p)
+            if angle is not None:
+                counts[min(int(angle // BIN_DEG), len(counts) - 1)] += 1
+    target = next((t for t in task.metric if t.name == "entry_angle_deg"), None)
+    return Histogram(tuple(counts), target.low if target else None, target.high if target else None)
+
+
+def event_lines(events: tuple[Event, ...]) -> tuple[EventLine, ...]:
+    """The events in words; those alike that follow each other are one line, late ticks are left out."""
+    shown = [(e, wording.describe(e)) for e in events if not isinstance(e, TickOverrun)]
+    lines = []
+    for (tool, kind, text), group in groupby(shown, key=lambda pair: (pair[0].tool, pair[0].kind, pair[1])):
+        alike = list(group)
+        lines.append(EventLine(alike[0][0].time_s, tool, kind, text, len(alike)))
+    return tuple(lines)

@@ -1,0 +1,138 @@
+"""Names, numbers and events in words, the same on paper and on the terminal."""
+
+from __future__ import annotations
+
+from datetime import datetime
+
+from trainer.events import (
+    Break,
+    Contact,
+    Drop,
+    Event,
+    Grasp,
+    Overforce,
+    Pierce,
+    PullThrough,
+    Release,
+    Slip,
+    StepDone,
+    TaskDone,
+    TaskStarted,
+    Tear,
+    TickOverrun,
+    TrackingBack,
+    TrackingLost,
+    Withdraw,
+)
+
+DISCLAIMER = "Training feedback, not a certificate."
+
+#: Units that are no part of a reader's language.
+_UNIT_WORDS = {"deg": "°", "count": "", "ratio": ""}
+
+
+def title(metric: str) -> str:
+    """A metric's name for a reader: without its unit and with spaces."""
+    for suffix in ("_deg", "_mm", "_s", "_mN", "_count"):
+        metric = metric.removesuffix(suffix)
+    words = metric.replace("_", " ")
+    return words[:1].upper() + words[1:]
+
+
+def unit_word(unit: str) -> str:
+    return _UNIT_WORDS.get(unit, unit)
+
+
+def number(value: float | None, unit: str = "") -> str:
+    """A value with as many digits as its unit deserves; a dash for None."""
+    if value is None:
+        return "–"
+    digits = {"deg": 1, "mm": 2, "s": 1, "mN": 1, "count": 0, "ratio": 2}.get(unit, 2)
+    if unit == "mm" and abs(value) >= 100.0:
+        digits = 0
+    return f"{value:.{digits}f}"
+
+
+def quantity(value: float | None, unit: str) -> str:
+    """A value with its unit."""
+    word = unit_word(unit)
+    gap = "" if word in ("", "°") else " "
+    return number(value, unit) + (gap + word if value is not None else "")
+
+
+def band(low: float | None, high: float | None, unit: str) -> str:
+    """A target band in words; empty without a target."""
+    word = unit_word(unit)
+    tail = word if word in ("", "°") else f" {word}"
+    if low is not None and high is not None:
+        return f"{low:g}{tail}" if low == high else f"{low:g} to {high:g}{tail}"
+    if high is not None:
+        return f"at most {high:g}{tail}"
+    return f"at least {low:g}{tail}" if low is not None else ""
+
+
+def date(started_at: str) -> str:
+    """The day and hour of an ISO 8601 time, in UTC as the log keeps it."""
+    moment = datetime.fromisoformat(started_at)
+    return f"{moment.day} {moment:%B %Y, %H:%M} UTC"
+
+
+def duration(seconds: float) -> str:
+    """Minutes and seconds."""
+    whole = round(seconds)
+    return f"{whole // 60} min {whole % 60:02d} s" if whole >= 60 else f"{seconds:.1f} s"
+
+
+def kind_word(kind: str) -> str:
+    return kind.replace("_", " ")
+
+
+def _place(axial_mm: float, clock_deg: float) -> str:
+    return f"{axial_mm:.2f} mm from the cut at {clock_deg:.0f}°"
+
+
+def _held(target: str, body: str) -> str:
+    return f"{target} of {body}" if body else target
+
+
+def describe(event: Event) -> str:
+    """What happened, in a few words. Raises TypeError for a kind that has no words."""
+    match event:
+        case Grasp():
+            return f"{_held(event.target, event.body)}, {event.force_mN:.0f} mN"
+        case Release():
+            return _held(event.target, event.body)
+        case Slip():
+            return f"{_held(event.target, event.body)} at {event.load_mN:.0f} mN"
+        case Drop():
+            return event.target
+        case Contact():
+            return f"{event.wall} wall of {event.body}, {_place(event.axial_mm, event.clock_deg)}"
+        case Pierce():
+            where = f"{event.wall} wall of {event.body}, {event.direction}, {_place(event.axial_mm, event.clock_deg)}"
+            return f"{where}; {event.entry_angle_deg:.0f}° to the wall, {event.force_mN:.1f} mN"
+        case Withdraw():
+            return f"{event.end} out of the {event.wall} wall of {event.body}"
+        case PullThrough():
+            return f"{event.wall} wall of {event.body}"
+        case Break():
+            return f"thread at {event.tension_mN:.0f} mN"
+        case Tear():
+            return f"{event.wall} wall of {event.body} at {event.force_mN:.0f} mN"
+        case Overforce():
+            where = f" on {event.body}" if event.body else ""
+            limit = f"{event.value:.0f} {event.unit}, limit {event.limit:.0f} {event.unit}"
+            return f"{event.quantity.replace('_', ' ')}{where}: {limit}"
+        case TrackingLost():
+            return "not seen by the device"
+        case TrackingBack():
+            return f"seen again after {event.lost_s:.2f} s"
+        case TickOverrun():
+            return f"{event.work_ms:.1f} ms of work in {event.slot_ms:.1f} ms"
+        case TaskStarted():
+            return event.task
+        case StepDone():
+            return event.step
+        case TaskDone():
+            return f"{event.outcome}: {event.reason}" if event.reason else event.outcome
+    raise TypeError(f"no words for an event of kind {event.kind!r}")
