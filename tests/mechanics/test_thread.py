@@ -199,7 +199,7 @@ def test_a_node_dragged_sideways_draws_the_tractrix(steps: int) -> None:
 
 
 def test_between_constraints_the_averaged_directions_turn_by_one_common_vector() -> None:
-    """The closure's law (thread_follow): u_j - w_j = (I - w_j w_j^T) m, to second order in m.
+    """The closure's law (thread_closure): u_j - w_j = (I - w_j w_j^T) m, to second order in m.
 
     w are the directions of the paper's average, formed here. Normalising w + m leaves at most |m|^2 per
     Newton step, and a second step is a correction of that size: 4 |m|^2 covers both.

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from scipy.optimize import linprog
 
 from trainer.geometry import Array
@@ -25,7 +26,7 @@ def slid_at(arcs: list[float], places: list[float], hard: list[bool]) -> Slid:
     return slide(MODEL, np.array(arcs), on_a_line(places), np.array(hard, dtype=bool), MODEL.whole())
 
 
-def least_sliding(arcs: Array, distances: Array, hard: Array) -> float | None:
+def least_sliding(arcs: Array, distances: Array, hard: NDArray[np.bool_]) -> float | None:
     """Least sum |ds| with s_{k+1} - s_k >= D_k by linear programming over (s, t), t >= |s - arcs|."""
     c = len(arcs)
     rows, limits = [], []

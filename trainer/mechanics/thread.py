@@ -8,9 +8,9 @@ arc s_c at a point: a hole in a vessel's wall (soft), a grip or the swage of a p
 lie inside a link, so the thread's polyline is nodes and constraint points sorted by s. ``slide`` first lets
 the thread run through the holes, then ``follow`` places the nodes.
 
-Between two constraints closer than about three links the nodes alone cannot always take up the slack (two
-holes on one link cannot come nearer to one another). There the longest link of the span folds: the
-polyline has one more point, half-way along that link. Lengths hold along this polyline, everywhere.
+Between two constraints with fewer than three nodes the nodes alone cannot always take up the slack (two holes
+on one link could not come nearer to one another). There the longest link of the span may fold: the polyline
+has one more point, half-way along that link. Lengths hold along this polyline, everywhere.
 
 A broken thread is several *pieces*, an array (p, 2) of arcs, each from a node to a node.
 """
@@ -25,7 +25,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from trainer.geometry import Array
-from trainer.mechanics.thread_follow import FOLD_NODES, SNAP, follow_kernel, perpendicular
+from trainer.mechanics.thread_closure import perpendicular
+from trainer.mechanics.thread_follow import FOLD_NODES, SNAP, follow_kernel
 from trainer.mechanics.thread_slide import slide_kernel
 
 
@@ -129,7 +130,9 @@ def follow(model: ThreadModel, x: Array, constraint_arc: Array, constraint_posit
     arcs, points = _constraints(constraint_arc, constraint_position)
     shortage = np.empty(len(arcs))
     work = np.empty((3, model.count + 1, 3))
-    follow_kernel(_nodes(model, x), model.needle_length, model.link, pieces, arcs, points, shortage, work[0], work[1], work[2])
+    follow_kernel(
+        _nodes(model, x), model.needle_length, model.link, pieces, arcs, points, shortage, work[0], work[1], work[2]
+    )
     return shortage
 
 
@@ -179,9 +182,14 @@ def _vertices(
     for row in range(rows):
         if work[row, 4] == 1.0:
             fold = -1
+            slack = SNAP * link
             for other in range(row + 1, min(row + 1 + FOLD_NODES, rows)):
-                if fold < 0 or work[other, 3] - work[other - 1, 3] > work[fold + 1, 3] - work[fold, 3]:
-                    fold = other - 1
+                dx = work[other, 0] - work[other - 1, 0]
+                dy = work[other, 1] - work[other - 1, 1]
+                dz = work[other, 2] - work[other - 1, 2]
+                lacking = work[other, 3] - work[other - 1, 3] - math.sqrt(dx * dx + dy * dy + dz * dz)
+                if lacking > slack:
+                    fold, slack = other - 1, lacking
                 if work[other, 4] == 1.0:
                     break
             else:
@@ -195,25 +203,24 @@ def _vertices(
             dz = work[row + 1, 2] - work[row, 2]
             length = work[row + 1, 3] - work[row, 3]
             chord2 = dx * dx + dy * dy + dz * dz
-            if math.sqrt(chord2) < length - SNAP * link:
-                before, after = max(row - 1, 0), min(row + 2, rows - 1)
-                nx = work[row, 0] + work[row + 1, 0] - work[before, 0] - work[after, 0]
-                ny = work[row, 1] + work[row + 1, 1] - work[before, 1] - work[after, 1]
-                nz = work[row, 2] + work[row + 1, 2] - work[before, 2] - work[after, 2]
-                if chord2 > 0.0:
-                    along = (nx * dx + ny * dy + nz * dz) / chord2
-                    nx, ny, nz = nx - along * dx, ny - along * dy, nz - along * dz
-                size = math.sqrt(nx * nx + ny * ny + nz * nz)
-                if size > 1e-6 * link:
-                    nx, ny, nz = nx / size, ny / size, nz / size
-                else:
-                    nx, ny, nz = perpendicular(dx, dy, dz)
-                height = 0.5 * math.sqrt(length * length - chord2)
-                out[count, 0] = work[row, 0] + 0.5 * dx + height * nx
-                out[count, 1] = work[row, 1] + 0.5 * dy + height * ny
-                out[count, 2] = work[row, 2] + 0.5 * dz + height * nz
-                out[count, 3], out[count, 4] = work[row, 3] + 0.5 * length, 0.0
-                count += 1
+            before, after = max(row - 1, 0), min(row + 2, rows - 1)
+            nx = work[row, 0] + work[row + 1, 0] - work[before, 0] - work[after, 0]
+            ny = work[row, 1] + work[row + 1, 1] - work[before, 1] - work[after, 1]
+            nz = work[row, 2] + work[row + 1, 2] - work[before, 2] - work[after, 2]
+            if chord2 > 0.0:
+                along = (nx * dx + ny * dy + nz * dz) / chord2
+                nx, ny, nz = nx - along * dx, ny - along * dy, nz - along * dz
+            size = math.sqrt(nx * nx + ny * ny + nz * nz)
+            if size > 1e-6 * link:
+                nx, ny, nz = nx / size, ny / size, nz / size
+            else:
+                nx, ny, nz = perpendicular(dx, dy, dz)
+            height = 0.5 * math.sqrt(length * length - chord2)
+            out[count, 0] = work[row, 0] + 0.5 * dx + height * nx
+            out[count, 1] = work[row, 1] + 0.5 * dy + height * ny
+            out[count, 2] = work[row, 2] + 0.5 * dz + height * nz
+            out[count, 3], out[count, 4] = work[row, 3] + 0.5 * length, 0.0
+            count += 1
     return count
 
 
