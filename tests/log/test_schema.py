@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -127,6 +128,15 @@ def test_a_newer_log_is_refused(path: Path) -> None:
     for opening in (open_log, create_log, migrate):
         with pytest.raises(LogError, match="newer version"):
             opening(path)
+
+
+def test_two_programs_may_make_the_log_at_once(tmp_path: Path) -> None:
+    """The second finds the tables of the first, or waits for them; neither sees half of them."""
+    with ThreadPoolExecutor(4) as pool:
+        made = [pool.submit(lambda: create_log(tmp_path / "s.db").close()) for _ in range(4)]
+    for m in made:
+        m.result()
+    open_log(tmp_path / "s.db").close()
 
 
 def test_a_damaged_log_names_the_way_out(path: Path) -> None:

@@ -99,10 +99,8 @@ def test_an_added_row_names_the_session(path: Path, name: str) -> None:
         taken = [f"{c} || '7'" if c == column else c for c in columns]
         if column != "name":
             taken = [f"{c} + 7000" if c == column else c for c in columns]
-        connection.execute(
-            f"insert into {name} ({', '.join(columns)}) select {', '.join(taken)} from {name} where session = ? limit 1",
-            (SESSION,),
-        )
+        copied = f"select {', '.join(taken)} from {name} where session = ? limit 1"
+        connection.execute(f"insert into {name} ({', '.join(columns)}) {copied}", (SESSION,))
     assert [p for p in problems(path) if SESSION in p]
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import secrets
 import sqlite3
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -107,8 +108,6 @@ def new_session_id() -> str:
 def create_log(path: Path) -> Database:
     """The log at ``path``, made (with its folder) where there is none. Raises LogError."""
     with clear_errors(path):
-        if path.exists() and path.stat().st_size > 0:
-            return open_log(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         return _connected(path, _make_tables)
 
@@ -179,8 +178,27 @@ def _connected(path: Path, prepare: Callable[[Database], None]) -> Database:
 
 
 def _make_tables(db: Database) -> None:
-    db.enable_wal()
-    migrations.apply(db)
+    if not db.table_names():
+        _write_ahead(db)
+        db.conn.execute("begin immediate")  # two programs may start at once, and either may be killed half-way
+        with db.atomic():
+            if not db.table_names():
+                migrations.apply(db)
+        db.conn.execute("commit")
+    _check_version(db)
+
+
+def _write_ahead(db: Database) -> None:
+    """Switch to the write-ahead log; alone of all statements this one does not wait for another program's lock."""
+    for pause_s in (0.01, 0.1, 0.5, 2.0, None):
+        try:
+            db.enable_wal()
+        except sqlite3.OperationalError:
+            if pause_s is None:
+                raise
+            time.sleep(pause_s)
+        else:
+            return
 
 
 def _check_own(db: Database) -> None:

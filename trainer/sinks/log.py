@@ -136,6 +136,7 @@ class LogSink:
 
     def _raise_error(self) -> None:
         if self._error is not None:
+            self._closed = True  # who calls now knows; closing need not say it again
             raise self._error
 
     def _run(self) -> None:
