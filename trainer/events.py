@@ -206,6 +206,14 @@ class StepDone(Event):
 
 
 @dataclass(frozen=True)
+class Aborted(Event):
+    """The trainee stopped the exercise."""
+
+    kind = "aborted"
+    reason: str
+
+
+@dataclass(frozen=True)
 class TaskDone(Event):
     """The exercise ended; the fields tell where everything is."""
 
@@ -224,7 +232,7 @@ KINDS: dict[str, type[Event]] = {
     cls.kind: cls
     for cls in (
         Grasp, Release, Slip, Drop, Contact, Pierce, Withdraw, PullThrough, Break, Tear, Overforce,
-        TrackingLost, TrackingBack, TickOverrun, TaskStarted, StepDone, TaskDone,
+        TrackingLost, TrackingBack, TickOverrun, TaskStarted, StepDone, Aborted, TaskDone,
     )
 }  # fmt: skip
 

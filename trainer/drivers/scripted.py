@@ -1,0 +1,477 @@
+"""Scripted hands: they look at the scene as a person does and move two instruments through a task.
+
+The hands know nothing that a trainee could not see: where needle, walls, holes and thread are at this tick.
+What they intend (angle, bite, clock) comes from the profile, or from the task's marks; how well they do it
+(tremor, aim, pauses, detours) comes from the profile alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from trainer.curriculum import Step, Task
+from trainer.drivers.hand_motion import Tremor, along_arc, between, ease, needle_pose, round_vessel, turn_angle
+from trainer.geometry import Array, Rigid, cross, quaternion_from_axes, unit
+from trainer.poses import ToolPoses
+from trainer.profile import Hand
+from trainer.view import HoleView, View
+
+Movement = Iterator[None]  # yields once per tick
+
+PRESS = 0.25  # speed while the needle goes through a wall, as a share of the hand's speed
+RUN_UP_MM = 0.4  # the tip's distance from the wall at which pressing begins
+STEER_DEG = 50.0  # inside a lumen the needle is steered to this angle, to leave by the cut end
+STAND_OFF_MM = 1.5  # an instrument's distance before it reaches for something
+CLEAR_MM = 2.5  # distance from a vessel's axis while moving round it
+ASIDE_DEG = 40.0  # at most this far from the vessel's axis lies the needle's plane, so that it passes the other end
+ASIDE_MM = 0.22  # and at most this far from the axis it leaves the lumen
+BITE_DEPTH_MM = 2.0  # arc beyond a hole at which the other hand takes over
+TAKE_AT_MM = 0.6  # distance from the tip at which the other hand takes the needle
+RISE = 0.4  # how steeply the thread is pulled away from the vessels
+JAW_S = 0.15  # time to open or close the jaws
+TURN = 2.0  # fastest turn of an instrument, rad/s (assumed)
+
+
+class _Lost(Exception):
+    """What the hand meant to do is no longer possible: it stops."""
+
+
+class ScriptedHands:
+    """A driver whose poses come from a plan; see :class:`trainer.profile.Hand` for its settings."""
+
+    def __init__(self, hand: Hand, task: Task, home: ToolPoses, seed: int) -> None:
+        self._hand = hand
+        self._task = task
+        self._dt = 1.0 / task.tick_hz
+        self._rng = np.random.default_rng([hand.seed, seed])
+        count = len(home.closure)
+        self._tremor = [Tremor(1e-3 * hand.tremor_rms_um, hand.tremor_hz, self._dt, self._rng) for _ in range(count)]
+        self._pose = [home.world_from_tool(i) for i in range(count)]  # intended, without tremor
+        self._closure = home.closure.copy()
+        self._plan: Movement | None = None
+        self._view: View
+        self._stopped = ""
+        needle = task.scene.needle
+        self._needle_length = needle.length_mm if needle else 0.0
+        self._radius = needle.length_mm / math.radians(needle.arc_deg) if needle else 1.0
+
+    def poll(self, tick: int, view: object) -> ToolPoses | None:
+        assert isinstance(view, View)
+        self._view = view
+        if self._plan is None:
+            self._plan = self._perform()
+        try:
+            next(self._plan)
+        except StopIteration:
+            return None
+        except _Lost as reason:
+            self._stopped = str(reason)
+            return None
+        return ToolPoses(
+            position=np.array([p.position + t.next() for p, t in zip(self._pose, self._tremor, strict=True)]),
+            quaternion=np.array([p.quaternion for p in self._pose]),
+            closure=self._closure.copy(),
+            valid=np.ones(len(self._pose), dtype=bool),
+        )
+
+    def summary(self) -> dict[str, object]:
+        return {"driver": "scripted", "stopped": self._stopped}
+
+    def close(self) -> None:
+        self._plan = None
+
+    # --- the plan ------------------------------------------------------------------------------------------------
+
+    def _perform(self) -> Movement:
+        steps = self._task.step
+        for index, step in enumerate(steps):
+            yield from self._hesitate()
+            if step.kind == "drive":
+                following = steps[index + 1].kind if index + 1 < len(steps) else ""
+                yield from self._drive(step, through=following != "withdraw")
+            elif step.kind == "withdraw":
+                yield from self._back_out()
+            elif step.kind == "tail":
+                yield from self._pull_tail(step)
+            else:
+                yield from self._approximate(step)
+        yield from self._wait(0.5)
+
+    def _drive(self, step: Step, through: bool) -> Movement:
+        hand = self._hand
+        driving = self._holder()
+        if not self._needle_is_through():
+            raise _Lost("the needle is still in a hole")
+        vessel = self._task_vessel(step.vessel)
+        radius = 0.5 * vessel.outer_diameter_mm
+        bite = (hand.bite_mm or step.bite_mm) + self._rng.normal(0.0, hand.aim_error_mm)
+        bite = min(max(bite, 0.05), 0.6 * vessel.length_mm)
+        clock = step.clock_deg if hand.clock_deg is None else hand.clock_deg
+        clock += math.degrees(self._rng.normal(0.0, hand.aim_error_mm) / radius)
+        angle = 90.0 if hand.entry_angle_deg is None else hand.entry_angle_deg
+        angle = 90.0 - abs(90.0 - angle - self._rng.normal(0.0, hand.entry_angle_error_deg))
+        aside = min(math.radians(ASIDE_DEG), math.atan2(ASIDE_MM, bite))
+        if step.direction == "out":
+            angle = min(angle, _steepest_from_lumen(bite, aside, radius, vessel.wall_mm, self._radius))
+        if driving != 1 and through:
+            yield from self._hand_over(driving)
+            driving = self._holder()
+        if step.direction == "in":
+            rest, _ = self._view.look(step.vessel, clock, bite, "outer")
+            yield from self._enter_from_outside(driving, step.vessel, clock, bite, math.radians(angle), aside)
+            if through:
+                yield from self._steer_out(step.vessel, driving, rest, aside)
+        else:
+            yield from self._enter_from_lumen(driving, step.vessel, clock, bite, math.radians(angle), aside)
+        if through:
+            yield from self._take_through(driving)
+
+    def _enter_from_outside(
+        self, tool: int, vessel: str, clock: float, bite: float, angle: float, aside: float
+    ) -> Movement:
+        point, normal = self._view.look(vessel, clock, bite, "outer")
+        tangent, inward = self._heading_in(vessel, normal, angle, aside)
+        offset = self._needle_from_tool(tool)
+        start = needle_pose(point - RUN_UP_MM * tangent, tangent, inward, 0.0, self._radius)
+        yield from self._carry_round(tool, start, offset, vessel)
+        tip = self._needle().position
+        travelled = 0.0
+        while not self._hole(vessel, "outer"):
+            _, normal = self._view.look(vessel, clock, bite, "outer")
+            tangent, inward = self._heading_in(vessel, normal, angle, aside)
+            tip = tip + self._press_step() * tangent
+            travelled += self._press_step()
+            if travelled > RUN_UP_MM + 1.5:
+                raise _Lost("the wall does not give way")
+            self._pose[tool] = needle_pose(tip, tangent, inward, 0.0, self._radius) @ offset
+            yield
+        yield from self._follow_arc(tool, offset, lambda: bool(self._hole(vessel, "inner")), 1.0, PRESS)
+
+    def _enter_from_lumen(
+        self, tool: int, vessel: str, clock: float, bite: float, angle: float, aside: float
+    ) -> Movement:
+        target, normal = self._view.look(vessel, clock, bite, "outer")
+        wall = self._task_vessel(vessel).wall_mm
+        tangent, inward = self._heading_out(vessel, normal, angle, aside)
+        offset = self._needle_from_tool(tool)
+        contact = needle_pose(target - tangent * wall / math.sin(angle), tangent, inward, 0.0, self._radius)
+        # The shaft of a needle at the wall leaves the lumen by the cut end, so the tip comes in along that same arc.
+        back = (2.0 * angle + 0.9) * self._radius
+        yield from self._carry_round(tool, along_arc(contact, -back, self._radius), offset, vessel)
+        run = 0.5 * RUN_UP_MM
+        yield from self._slide_along_arc(tool, contact, offset, -back, -run)
+        tip = self._needle().position
+        travelled = 0.0
+        while not self._hole(vessel, "outer"):
+            target, normal = self._view.look(vessel, clock, bite, "outer")
+            tangent, inward = self._heading_out(vessel, normal, angle, aside)
+            way = target - self._needle().position
+            aim = unit(way) if np.linalg.norm(way) > 0.03 else tangent
+            tip = tip + self._press_step() * aim
+            travelled += self._press_step()
+            if travelled > run + wall / math.sin(angle) + 1.5:
+                raise _Lost("the wall does not give way")
+            self._pose[tool] = needle_pose(tip, tangent, inward, 0.0, self._radius) @ offset
+            yield
+        yield from self._follow_arc(
+            tool, offset, lambda: self._arc_in(vessel, "outer") >= BITE_DEPTH_MM, BITE_DEPTH_MM + 1.0, 1.0
+        )
+
+    def _steer_out(self, vessel: str, tool: int, rest: Array, aside: float) -> Movement:
+        """Let the dent go back to where the wall was at ``rest``, pivot there towards the cut end, and advance."""
+        hole = self._hole(vessel, "outer")
+        if hole is None:
+            raise _Lost("the needle has left its hole")
+        offset = self._needle_from_tool(tool)
+        point, s0 = hole.point.copy(), hole.arc_mm
+        normal = self._outward(vessel, rest)
+        needle = self._needle().matrix()
+        phi = s0 / self._radius
+        tangent = math.cos(phi) * needle[:, 0] - math.sin(phi) * needle[:, 1]
+        steep0 = math.asin(min(1.0, max(-1.0, float(-tangent @ normal))))
+        steep1 = min(steep0, math.radians(STEER_DEG))
+        seconds = max(2.0 * abs(steep1 - steep0) / TURN, (BITE_DEPTH_MM - s0) / (PRESS * self._hand.speed_mm_s))
+        ticks = max(1, math.ceil(seconds / self._dt))
+        for k in range(1, ticks + 1):
+            u = ease(k / ticks)
+            pivoted = min(1.0, 3.0 * u)
+            t, c = self._heading_in(vessel, normal, steep0 + pivoted * (steep1 - steep0), aside)
+            at = point + pivoted * (rest - point)
+            self._pose[tool] = needle_pose(at, t, c, s0 + u * (BITE_DEPTH_MM - s0), self._radius) @ offset
+            yield
+
+    def _take_through(self, driving: int) -> Movement:
+        """The other hand takes the needle near its tip and draws it through, with the thread after it."""
+        yield from self._hand_over(driving, TAKE_AT_MM)
+        taking = 1 - driving
+        offset = self._needle_from_tool(taking)
+        yield from self._follow_arc(taking, offset, self._needle_is_through, 1.5 * self._needle_length, 0.5)
+        yield from self._follow_arc(taking, offset, lambda: False, 0.5, 0.5, at_end=None)
+        clear = Rigid(self._needle().position + 3.0 * self._away_from_vessels(), self._needle().quaternion)
+        yield from self._carry(taking, clear, offset)
+
+    def _back_out(self) -> Movement:
+        tool = self._holder()
+        offset = self._needle_from_tool(tool)
+        start = self._needle()
+        moved = 0.0
+        while self._view.holes:
+            moved -= PRESS * self._hand.speed_mm_s * self._dt
+            if moved < -self._needle_length - 1.0:
+                raise _Lost("the needle does not come out")
+            self._pose[tool] = along_arc(start, moved, self._radius) @ offset
+            yield
+        away = self._away_from_vessels()
+        here = self._needle()
+        yield from self._carry(tool, Rigid(here.position + 1.0 * away, here.quaternion), offset)
+
+    def _pull_tail(self, step: Step) -> Movement:
+        tool = self._holder()
+        last = [s.vessel for s in self._task.step if s.kind == "drive"][-1]
+        away = self._across(last, self._needle().position)
+        aim = 0.75 * step.at_most_mm
+        while self._view.tail_mm > aim:
+            self._pose[tool] = Rigid(
+                self._pose[tool].position + self._hand.speed_mm_s * self._dt * away, self._pose[tool].quaternion
+            )
+            yield
+
+    def _approximate(self, step: Step) -> Movement:
+        thread = self._view.thread
+        if thread is None or self._view.tail_mm <= 0.0:
+            raise _Lost("there is no tail to take")
+        tool = 1 - self._holder()
+        link = self._task.scene.thread.link_mm if self._task.scene.thread else 1.0
+        node = len(thread) - 1 - max(1, round(0.3 * self._view.tail_mm / link))
+        yield from self._jaws(tool, 0.0)
+        point = thread[node]
+        reach = Rigid(point, self._pose[tool].quaternion)
+        back = Rigid(point - STAND_OFF_MM * reach.matrix()[:, 0], reach.quaternion)
+        yield from self._glide(tool, back)
+        yield from self._glide(tool, Rigid(thread[node], reach.quaternion), 0.5)
+        yield from self._jaws(tool, 1.0)
+        if tool not in self._view.thread_holders:
+            raise _Lost("the thread was not caught")
+        first = next(s.vessel for s in self._task.step if s.kind == "drive")
+        direction = self._across(first, point)
+        pulled = 0.0
+        done = self._view.steps_done
+        while self._view.steps_done == done:
+            stride = PRESS * self._hand.speed_mm_s * self._dt
+            pulled += stride
+            if pulled > 8.0 or tool not in self._view.thread_holders:
+                raise _Lost("the ends do not come together")
+            self._pose[tool] = Rigid(self._pose[tool].position + stride * direction, self._pose[tool].quaternion)
+            yield
+
+    # --- movements -----------------------------------------------------------------------------------------------
+
+    def _hand_over(self, giving: int, at_mm: float | None = None) -> Movement:
+        """The other instrument takes the needle at ``at_mm`` from its tip (where a task holds it by default)."""
+        taking = 1 - giving
+        needle_spec = self._task.scene.needle
+        assert needle_spec is not None
+        arc = needle_spec.held_at * self._needle_length if at_mm is None else at_mm
+        yield from self._jaws(taking, 0.0)
+        grip = self._grip(self._needle(), arc)
+        yield from self._glide(taking, Rigid(grip.position - STAND_OFF_MM * grip.matrix()[:, 0], grip.quaternion))
+        yield from self._glide(taking, self._grip(self._needle(), arc), 0.5)
+        yield from self._jaws(taking, 1.0)
+        if taking not in self._view.needle_holders:
+            raise _Lost("the needle was not caught")
+        yield from self._jaws(giving, 0.0)
+        here = self._pose[giving]
+        yield from self._glide(giving, Rigid(here.position - 2.0 * here.matrix()[:, 0], here.quaternion))
+
+    def _grip(self, needle: Rigid, arc: float) -> Rigid:
+        """Where an instrument holds the needle at ``arc``: jaws pointing at the circle's centre, across the wire."""
+        phi = arc / self._radius
+        s, c = math.sin(phi), math.cos(phi)
+        matrix = needle.matrix()
+        point = needle.apply(np.array([-self._radius * s, self._radius * (1.0 - c), 0.0]))
+        inward = s * matrix[:, 0] + c * matrix[:, 1]
+        return Rigid(point, quaternion_from_axes(inward, matrix[:, 2]))
+
+    def _glide(self, tool: int, target: Rigid, pace: float = 1.0) -> Movement:
+        """An instrument that carries nothing moves straight to ``target``."""
+        start = self._pose[tool]
+        bump = self._detour()
+        for u in self._paced(start, target, pace):
+            pose = between(start, target, u)
+            self._pose[tool] = Rigid(pose.position + math.sin(math.pi * u) ** 2 * bump, pose.quaternion)
+            yield
+
+    def _carry(self, tool: int, target: Rigid, offset: Rigid) -> Movement:
+        """The needle, held by ``tool``, moves straight to ``target``."""
+        yield from self._glide(tool, target @ offset)
+
+    def _carry_round(self, tool: int, target: Rigid, offset: Rigid, vessel: str) -> Movement:
+        """The needle moves to ``target`` with its tip well clear of the vessels."""
+        yield from self._hesitate()
+        axis = self._view.vessel_axis[vessel]
+        origin, _ = self._vessel_origin(vessel)
+        start = self._needle()
+        way = round_vessel(start.position, target.position, origin, axis, CLEAR_MM)
+        lengths = [float(np.linalg.norm(b - a)) for a, b in zip(way, way[1:], strict=False)]
+        total = sum(lengths) or 1.0
+        done = 0.0
+        for point, length in zip(way[1:], lengths, strict=True):
+            done += length
+            turned = between(start, target, done / total)
+            pose = target if point is way[-1] else Rigid(point, turned.quaternion)
+            yield from self._carry(tool, pose, offset)
+
+    def _follow_arc(
+        self,
+        tool: int,
+        offset: Rigid,
+        until: Callable[[], bool],
+        at_most: float,
+        pace: float,
+        at_end: str | None = "the needle does not go through",
+    ) -> Movement:
+        """Move the needle along its own circle ``until`` something is seen; past ``at_most`` mm give up."""
+        start = self._needle()
+        moved = 0.0
+        while not until():
+            moved += pace * self._hand.speed_mm_s * self._dt
+            if moved > at_most:
+                if at_end is None:
+                    return
+                raise _Lost(at_end)
+            self._pose[tool] = along_arc(start, moved, self._radius) @ offset
+            yield
+
+    def _slide_along_arc(self, tool: int, pose: Rigid, offset: Rigid, first: float, last: float) -> Movement:
+        """The needle goes from ``first`` to ``last`` mm along the circle through ``pose``, easing in and out."""
+        ticks = max(1, math.ceil(abs(last - first) / self._hand.speed_mm_s / self._dt))
+        for k in range(1, ticks + 1):
+            distance = first + ease(k / ticks) * (last - first)
+            self._pose[tool] = along_arc(pose, distance, self._radius) @ offset
+            yield
+
+    def _paced(self, start: Rigid, target: Rigid, pace: float) -> Iterator[float]:
+        seconds = max(
+            float(np.linalg.norm(target.position - start.position)) / (pace * self._hand.speed_mm_s),
+            turn_angle(start, target) / TURN,
+        )
+        ticks = max(1, math.ceil(seconds / self._dt))
+        for k in range(1, ticks + 1):
+            yield ease(k / ticks)
+
+    def _jaws(self, tool: int, closure: float) -> Movement:
+        start = float(self._closure[tool])
+        ticks = max(1, round(JAW_S / self._dt))
+        for k in range(1, ticks + 1):
+            self._closure[tool] = start + (closure - start) * k / ticks
+            yield
+        yield
+
+    def _wait(self, seconds: float) -> Movement:
+        for _ in range(math.ceil(seconds / self._dt)):
+            yield
+
+    def _hesitate(self) -> Movement:
+        if self._hand.hesitation_s > 0.0:
+            yield from self._wait(self._rng.exponential(self._hand.hesitation_s))
+
+    # --- what the hand sees --------------------------------------------------------------------------------------
+
+    def _detour(self) -> Array:
+        return self._rng.normal(0.0, 1.0, 3) * self._hand.wander_mm
+
+    def _press_step(self) -> float:
+        return PRESS * self._hand.speed_mm_s * self._dt
+
+    def _holder(self) -> int:
+        if not self._view.needle_holders:
+            raise _Lost("nobody holds the needle")
+        return self._view.needle_holders[0]
+
+    def _needle(self) -> Rigid:
+        if self._view.world_from_needle is None:
+            raise _Lost("there is no needle")
+        return self._view.world_from_needle
+
+    def _needle_from_tool(self, tool: int) -> Rigid:
+        return self._needle().inverse() @ self._view.poses.world_from_tool(tool)
+
+    def _hole(self, vessel: str, wall: str) -> HoleView | None:
+        """The hole of this pass: the last one made there that the needle is in."""
+        inside = [
+            h for h in self._view.holes if h.vessel == vessel and h.wall == wall and h.arc_mm <= self._needle_length
+        ]
+        return inside[-1] if inside else None
+
+    def _arc_in(self, vessel: str, wall: str) -> float:
+        hole = self._hole(vessel, wall)
+        return hole.arc_mm if hole else -math.inf
+
+    def _needle_is_through(self) -> bool:
+        return all(h.arc_mm > self._needle_length for h in self._view.holes)
+
+    def _task_vessel(self, name: str):  # type: ignore[no-untyped-def]
+        return next(v for v in self._task.scene.vessel if v.name == name)
+
+    def _vessel_origin(self, vessel: str) -> tuple[Array, Array]:
+        """The centre of the cut edge and a point of the wall at 12 o'clock, both as seen now."""
+        top, _ = self._view.look(vessel, 0.0, 0.0, "outer")
+        bottom, _ = self._view.look(vessel, 180.0, 0.0, "outer")
+        return 0.5 * (top + bottom), top
+
+    def _outward(self, vessel: str, point: Array) -> Array:
+        origin, _ = self._vessel_origin(vessel)
+        axis = self._view.vessel_axis[vessel]
+        out = point - origin
+        return unit(out - (out @ axis) * axis)
+
+    def _away_from_vessels(self) -> Array:
+        """From the axis of the vessels outwards, towards the needle."""
+        vessel = self._task.scene.vessel[0].name
+        return self._outward(vessel, self._needle().position)
+
+    def _across(self, vessel: str, point: Array) -> Array:
+        """From a vessel's wall across the cut to the other end, rising: pulled that way a thread closes the gap."""
+        return unit(RISE * self._outward(vessel, point) - self._view.vessel_axis[vessel])
+
+    def _heading_in(self, vessel: str, normal: Array, steep: float, aside: float) -> tuple[Array, Array]:
+        """Tangent and inward direction of a needle that dives at ``steep`` rad and turns towards the cut end."""
+        level = self._level(vessel, normal, -1.0, aside)
+        s, c = math.sin(steep), math.cos(steep)
+        return c * level - s * normal, s * level + c * normal
+
+    def _heading_out(self, vessel: str, normal: Array, steep: float, aside: float) -> tuple[Array, Array]:
+        """The same for a needle that comes in by the cut end and rises at ``steep`` rad through the wall."""
+        level = self._level(vessel, normal, 1.0, aside)
+        s, c = math.sin(steep), math.cos(steep)
+        return c * level + s * normal, c * normal - s * level
+
+    def _level(self, vessel: str, normal: Array, sign: float, aside: float) -> Array:
+        """A direction in the wall's tangent plane, ``aside`` rad from the vessel's axis."""
+        axis = sign * self._view.vessel_axis[vessel]
+        along = unit(axis - (axis @ normal) * normal)
+        return math.cos(aside) * along + math.sin(aside) * cross(normal, along)
+
+
+def _steepest_from_lumen(bite: float, aside: float, radius: float, wall: float, needle: float) -> float:
+    """The steepest angle in degrees at which a needle inside a lumen can meet the wall at ``bite`` mm from its end.
+
+    The shaft must leave by the open end without touching the opposite wall: where the circle of radius ``needle``
+    through the tip reaches the cut plane, it must lie within nine tenths of the lumen's radius.
+    """
+    lumen = radius - wall
+    for degrees in range(90, 20, -1):
+        steep = math.radians(degrees)
+        run = bite / math.cos(aside)
+        sine = math.sin(steep) - run / needle
+        if sine < -1.0:
+            continue
+        depth = wall + needle * (math.sqrt(1.0 - sine * sine) - math.cos(steep))
+        if math.hypot(radius - depth, run * math.sin(aside)) <= 0.9 * lumen:
+            return float(degrees)
+    return 20.0
+
+

@@ -1,0 +1,49 @@
+"""The steps of a task: which one is reached."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from trainer.anatomy.vessel import wall_point
+from trainer.curriculum import Step
+from trainer.interactions.thread_pull import tail_mm
+from trainer.interactions.world import Hole, World
+
+
+def reached(world: World, step: Step, used: set[int]) -> bool:
+    """Whether ``step`` is reached now; a pass of the needle counts for one step only and is put into ``used``."""
+    if step.kind == "drive":
+        passes = _driven(world, step) - used
+        used |= passes
+        return bool(passes)
+    if step.kind == "withdraw":
+        return not world.open_holes()
+    threaded = [h for h in world.open_holes() if world.needle is not None and h.arc > world.needle.length]
+    if step.kind == "tail":
+        return len(threaded) == len(world.open_holes()) and 0.0 < tail_mm(world) <= step.at_most_mm
+    return bool(threaded) and 0.0 < gap_mm(world) <= step.at_most_mm
+
+
+def gap_mm(world: World) -> float:
+    """Distance of the cut edges of two vessels at the stitch that joins them; 0 without a stitch."""
+    if world.tissue is None or world.solver is None:
+        return 0.0
+    outer: dict[int, Hole] = {h.place.vessel: h for h in world.open_holes() if h.place.wall == "outer"}
+    if len(outer) != 2:
+        return 0.0
+    edges = []
+    for v, hole in outer.items():
+        nodes, weights = wall_point(world.tissue.vessels[v], hole.place.clock, 0.0, "outer")
+        edges.append(weights @ world.solver.x[nodes + world.tissue.offset[v]])
+    return math.dist(*(np.asarray(e) for e in edges))
+
+
+def _driven(world: World, step: Step) -> set[int]:
+    """Passes of the needle that went through both walls of the step's vessel the way it asks."""
+    walls: dict[int, set[str]] = {}
+    for hole in world.open_holes():
+        if world.vessel_name(hole.place) == step.vessel and hole.inwards == (step.direction == "in"):
+            walls.setdefault(hole.pass_number, set()).add(hole.place.wall)
+    return {number for number, seen in walls.items() if seen == {"outer", "inner"}}

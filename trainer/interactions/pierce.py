@@ -1,0 +1,199 @@
+"""The needle's tip and a wall: contact, piercing, and the holes that the needle then goes through.
+
+A tip that meets a wall sticks to the material it touched and dents it, until the force along the needle
+reaches the wall's puncture force (Brown 2001, section 5: a collision of needle and vessel face). The instant
+of puncture is interpolated between the two ends of the movement, and so are the values of the event.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from trainer.anatomy.vessel import material_coordinates, ring
+from trainer.curriculum import VesselSpec
+from trainer.events import Contact, Pierce, PullThrough, Withdraw
+from trainer.geometry import Array, Rigid, unit
+from trainer.instruments.needle import needle_closest, needle_point, needle_tangent
+from trainer.interactions.crossing import first_crossing, nearest_on_surface
+from trainer.interactions.world import Hole, Place, TipContact, World, vector
+
+#: A tip pushed hard but not along itself goes through as well, at this many puncture forces (assumed).
+SIDEWAYS = 2.0
+#: Needle behind the tip, mm, up to which the wall next to its hole counts as already crossed.
+JUST_THROUGH_MM = 0.4
+
+
+def detect(world: World, before: Rigid, after: Rigid, start_s: float, span_s: float, tool: str) -> None:
+    """Begin a contact where the tip meets a wall on its way from ``before`` to ``after`` (world_from_needle)."""
+    if world.tissue is None or world.solver is None or world.contact is not None:
+        return
+    best: tuple[float, Place, bool] | None = None
+    for v in range(len(world.tissue.vessels)):
+        for wall in ("outer", "inner"):
+            triangles = world.walls[v, wall]
+            skip = _passed(world, v, wall, triangles)
+            hit = first_crossing(before.position, after.position, world.before, world.solver.x, triangles, skip)
+            if hit is not None and (best is None or hit[1] < best[0]):
+                best = (hit[1], place_on(world, v, wall, triangles[hit[0]], hit[3]), hit[2])
+    if best is None:
+        return
+    fraction, place, inwards = best
+    normal, _ = world.undented(place)
+    slot = world.solver.hold(place.nodes, place.weights)
+    world.contact = TipContact(place, slot, inwards, _sticks(world, after, normal), fraction, 0.0, normal)
+    point = before.position + fraction * (after.position - before.position)
+    world.emit(
+        Contact, start_s + fraction * span_s, tool, body=world.vessel_name(place), wall=place.wall,
+        direction="in" if inwards else "out", point=vector(point), axial_mm=place.axial_mm,
+        clock_deg=math.degrees(place.clock),
+    )  # fmt: skip
+
+
+def glide(world: World) -> None:
+    """A tip too flat to stick slides along the wall: it now touches the material nearest to it."""
+    contact = world.contact
+    if contact is None or contact.stuck or world.solver is None:
+        return
+    tip = world.needle_pose.position
+    triangles = world.walls[contact.place.vessel, contact.place.wall]
+    triangle, weights = nearest_on_surface(tip, world.solver.x, triangles)
+    world.solver.drop(contact.slot)
+    contact.place = place_on(world, contact.place.vessel, contact.place.wall, triangles[triangle], weights)
+    contact.slot = world.solver.hold(contact.place.nodes, contact.place.weights)
+
+
+def puncture(
+    world: World, before: Rigid, after: Rigid, force: Array, start_s: float, span_s: float, tool: str
+) -> None:
+    """Judge the contact by the ``force`` (3,) mN of the tip on the wall at the end of a movement.
+
+    The contact ends when the wall pulls the tip back; it becomes a hole when the wall gives way.
+    """
+    contact = world.contact
+    if contact is None or world.tissue is None or world.solver is None:
+        return
+    normal, surface = world.undented(contact.place)
+    pressing = -normal if contact.inwards else normal
+    tangent = after.rotate(np.array([1.0, 0.0, 0.0]))
+    if force @ pressing < 0.0:
+        world.solver.drop(contact.slot)
+        world.contact = None
+        # The tip is back on the side it came from, but only as the wall lies now.
+        world.before = world.solver.x.copy()
+        return
+    along, limit = float(force @ tangent), _puncture_mN(world, contact.place)
+    reached = max(along, float(np.linalg.norm(force)) / SIDEWAYS)
+    if reached < limit:
+        contact.stuck = _sticks(world, after, normal)
+        contact.force_mN, contact.normal, contact.fraction = reached, normal, 0.0
+        return
+    rise = reached - contact.force_mN
+    share = contact.fraction + (1.0 - contact.fraction) * ((limit - contact.force_mN) / rise if rise > 0.0 else 1.0)
+    tip = before.position + share * (after.position - before.position)
+    heading = before.rotate(np.array([1.0, 0.0, 0.0]))
+    heading = unit(heading + share * (tangent - heading))
+    upright = unit(contact.normal + share * (normal - contact.normal))
+    if all(h.arc > _needle_length(world) for h in world.open_holes()):
+        world.passes += 1
+    hole = Hole(len(world.holes), contact.place, contact.slot, contact.inwards, world.passes, arc=0.0)
+    world.holes.append(hole)
+    world.contact = None
+    world.emit(
+        Pierce, start_s + share * span_s, tool, body=world.vessel_name(hole.place), wall=hole.place.wall,
+        direction="in" if hole.inwards else "out", pass_number=hole.pass_number, hole=hole.number,
+        point=vector(tip), axial_mm=hole.place.axial_mm, clock_deg=math.degrees(hole.place.clock),
+        tangent=vector(heading), normal=vector(upright),
+        entry_angle_deg=math.degrees(math.asin(min(1.0, abs(float(heading @ upright))))),
+        force_mN=limit if along >= limit else along, depth_mm=float((surface - tip) @ upright),
+    )  # fmt: skip
+
+
+def follow_needle(world: World, time_s: float, tool: str) -> None:
+    """Bring each hole on the needle to the arc at which the needle now goes through it."""
+    if world.needle is None or world.solver is None:
+        return
+    length = world.needle.length
+    for hole in world.open_holes():
+        hole.slid_mm = 0.0
+        if hole.arc > length:
+            continue
+        at = world.needle_pose.inverse().apply(world.point(hole.place))
+        arc = _arc_through(world, at)
+        was = hole.arc
+        hole.slid_mm, hole.arc = arc - was, arc
+        hole.along = world.needle_pose.rotate(needle_tangent(world.needle, min(max(arc, 0.0), length)))
+        # The outer wall's normal serves both walls: it is the way through.
+        normal, _ = world.undented(hole.place)
+        beyond = (world.needle_pose.position - world.point(hole.place)) @ normal
+        hole.reached_mm = max(hole.reached_mm, float(-beyond if hole.inwards else beyond))
+        shared = {
+            "body": world.vessel_name(hole.place), "wall": hole.place.wall, "hole": hole.number,
+            "pass_number": hole.pass_number, "reached_mm": hole.reached_mm,
+        }  # fmt: skip
+        if arc < 0.0 and was < 0.0:  # a movement later, when the tip's way out is behind what ``detect`` looks at
+            close(world, hole)
+            world.emit(Withdraw, time_s, tool, end="tip", **shared)
+        elif arc > length:
+            world.emit(PullThrough, time_s, tool, **shared)
+            if world.thread is None:
+                close(world, hole)
+
+
+def close(world: World, hole: Hole) -> None:
+    """Nothing goes through the hole any more; the mark stays."""
+    assert world.solver is not None
+    world.solver.drop(hole.slot)
+    hole.open = False
+
+
+def place_on(world: World, vessel: int, wall: str, nodes: np.ndarray, weights: Array) -> Place:
+    """The material point of a triangle (3,) of the whole tissue's nodes, with barycentric ``weights`` (3,)."""
+    assert world.tissue is not None
+    inside = np.clip(weights, 0.0, None)
+    inside = inside / inside.sum()
+    v = world.tissue.vessels[vessel]
+    axial, clock = material_coordinates(v, nodes - world.tissue.offset[vessel], inside)
+    return Place(vessel, wall, nodes.astype(np.int32), inside, axial, clock, ring(v, clock, axial))
+
+
+def _arc_through(world: World, at: Array) -> float:
+    """Arc (mm) at which the needle passes a point of its own frame; negative ahead of the tip.
+
+    Ahead of the tip and behind the rear end the needle goes on as its tangents there.
+    """
+    assert world.needle is not None
+    if at[0] > 0.0 and abs(at[1]) < world.needle.radius:
+        return -float(at[0])
+    _, arc = needle_closest(world.needle, at)
+    if arc < world.needle.length:
+        return arc
+    end = at - needle_point(world.needle, world.needle.length)
+    return world.needle.length + max(0.0, -float(end @ needle_tangent(world.needle, world.needle.length)))
+
+
+def _needle_length(world: World) -> float:
+    return world.needle.length if world.needle else 0.0
+
+
+def _passed(world: World, vessel: int, wall: str, triangles: np.ndarray) -> np.ndarray:
+    """Triangles (f,) bool that touch a hole which the tip has only just gone through, or is coming back to."""
+    skip = np.zeros(len(triangles), dtype=np.bool_)
+    for hole in world.open_holes():
+        if hole.place.vessel == vessel and hole.place.wall == wall and hole.arc < JUST_THROUGH_MM:
+            skip |= np.isin(triangles, hole.place.nodes).any(axis=1)
+    return skip
+
+
+def _sticks(world: World, pose: Rigid, normal: Array) -> bool:
+    spec = world.task.scene.needle
+    assert spec is not None
+    tangent = pose.rotate(np.array([1.0, 0.0, 0.0]))
+    return abs(float(tangent @ normal)) >= math.sin(math.radians(spec.skid_deg.value))
+
+
+def _puncture_mN(world: World, place: Place) -> float:
+    assert world.tissue is not None
+    spec: VesselSpec = world.tissue.vessels[place.vessel].spec
+    return (spec.puncture_outer_mN if place.wall == "outer" else spec.puncture_inner_mN).value

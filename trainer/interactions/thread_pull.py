@@ -1,0 +1,210 @@
+"""The thread between needle, holes and grips: sliding, pulling on tissue, slipping, breaking, tearing.
+
+Swage and grips are hard constraints, holes are soft ones (Brown 2001, section 4): the thread slides through a
+hole to relieve a stretch. Between two hard constraints with too little thread for that, it draws its holes
+together: a taut cable in the tissue's equilibrium, whose tension slips a grip or breaks the thread.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from trainer.events import Break, Withdraw
+from trainer.geometry import Array, Rigid, cross, quaternion_from_axis_angle, quaternion_multiply, unit
+from trainer.instruments.needle import needle_point
+from trainer.interactions.pierce import close
+from trainer.interactions.world import Hole, World
+from trainer.mechanics.attachments import Cable
+from trainer.mechanics.thread import break_at, closest, follow, length_error, polyline, slide
+
+#: Thread that may creep through a grip in one movement, mm; what lacks beyond it makes the grip slip or the thread break.
+CREEP_MM = 0.02
+
+
+@dataclass(frozen=True)
+class Constraints:
+    """Where the thread is held, in the order of the arcs. A row is a hole, a grip, or the swage (neither)."""
+
+    arc: Array  # (c,) mm
+    position: Array  # (c, 3) mm
+    hard: np.ndarray  # (c,) bool
+    hole: tuple[Hole | None, ...]
+    grip: tuple[int, ...]  # instrument, or -1
+
+
+def constraints(world: World) -> Constraints:
+    """Swage, holes and grips as they are now."""
+    assert world.thread is not None and world.needle is not None
+    rows: list[tuple[float, int, Array, bool, Hole | None, int]] = []
+    if needle_is_placed(world):
+        rows.append((world.thread.needle_length, 0, swage(world), True, None, -1))
+    # Holes that meet on one arc keep the order in which the needle made them: the latest is nearest to it.
+    for order, hole in enumerate(reversed(world.open_holes())):
+        if hole.arc > world.needle.length:
+            rows.append((hole.arc, 1 + order, world.point(hole.place), False, hole, -1))
+    for i, jaw in enumerate(world.jaws):
+        if jaw.target == "thread":
+            rows.append((jaw.arc, 1000 + i, jaw.pose.position, True, None, i))
+    rows.sort(key=lambda r: r[:2])
+    return Constraints(
+        arc=np.array([r[0] for r in rows]),
+        position=np.array([r[2] for r in rows]).reshape(-1, 3),
+        hard=np.array([r[3] for r in rows], dtype=np.bool_),
+        hole=tuple(r[4] for r in rows),
+        grip=tuple(r[5] for r in rows),
+    )
+
+
+def needle_is_placed(world: World) -> bool:
+    """Whether an instrument or a wall holds the needle; else it trails behind the thread."""
+    return world.needle_tool() is not None or any(
+        world.needle is not None and h.arc <= world.needle.length for h in world.open_holes()
+    )
+
+
+def swage(world: World) -> Array:
+    """The needle's rear end (3,) mm, where the thread begins."""
+    assert world.needle is not None
+    return world.needle_pose.apply(needle_point(world.needle, world.needle.length))
+
+
+def cables(held: Constraints) -> list[tuple[int, int, Cable]]:
+    """The stretches of thread between two hard constraints with holes between: (first row, last row, cable)."""
+    found = []
+    hard = np.flatnonzero(held.hard)
+    for first, last in zip(hard[:-1], hard[1:], strict=True):
+        rows = range(int(first), int(last) + 1)
+        if len(rows) > 2:
+            slots = np.array([h.slot if (h := held.hole[r]) is not None else -1 for r in rows], dtype=np.int64)
+            length = float(held.arc[last] - held.arc[first])
+            found.append((int(first), int(last), Cable(slots, held.position[rows.start : rows.stop], length)))
+    return found
+
+
+def settle(world: World, time_s: float) -> None:
+    """Let the thread slide through its holes and lay it from constraint to constraint."""
+    if world.thread is None:
+        return
+    held = constraints(world)
+    slid = slide(world.thread, held.arc, held.position, held.hard, world.pieces)
+    for row, hole in enumerate(held.hole):
+        if hole is None:
+            continue
+        hole.slid_mm = float(slid.arc[row] - hole.arc)
+        hole.along = _towards_needle(held, row)
+        hole.arc = float(slid.arc[row])
+        if slid.pulled_out[row]:
+            close(world, hole)
+            world.emit(
+                Withdraw, time_s, "", body=world.vessel_name(hole.place), wall=hole.place.wall, hole=hole.number,
+                pass_number=hole.pass_number, end="tail", reached_mm=hole.reached_mm,
+            )  # fmt: skip
+    _creep(held, slid.shortage, world)
+    lay(world)
+
+
+def overdrawn(world: World) -> list[tuple[tuple[int, ...], float, float]]:
+    """Stretches of thread that two hard constraints pull further apart than thread and tissue allow.
+
+    For each the instruments that hold it, the arc (mm) at which it would break, and how much thread lacks (mm).
+    """
+    held = constraints(world)
+    slid = slide(world.thread, held.arc, held.position, held.hard, world.pieces) if world.thread else None
+    found = []
+    hard = np.flatnonzero(held.hard)
+    for first, last in zip(hard[:-1], hard[1:], strict=True):
+        lack = float(slid.shortage[first]) if slid is not None else 0.0
+        if lack > CREEP_MM:
+            gripping = [g for g in (held.grip[first], held.grip[last]) if g >= 0]
+            leader = world.needle_tool()
+            if held.grip[first] < 0 and leader is not None:
+                gripping.append(leader)
+            found.append((tuple(gripping), 0.5 * float(held.arc[first] + held.arc[first + 1]), lack))
+    return found
+
+
+def _creep(held: Constraints, shortage: Array, world: World) -> None:
+    """A taut thread creeps through a grip by what the tissue's equilibrium has left over: micrometres."""
+    for row, lack in enumerate(shortage):
+        if lack > 0.0:
+            last = next(r for r in range(row + 1, len(held.arc)) if held.hard[r])
+            if held.grip[last] >= 0:
+                world.jaws[held.grip[last]].arc += float(lack)
+
+
+def lay(world: World) -> Constraints:
+    """Place the thread's nodes between the constraints; a needle that nothing holds trails behind."""
+    assert world.thread is not None
+    held = constraints(world)
+    follow(world.thread, world.nodes, held.arc, held.position, world.pieces)
+    if not needle_is_placed(world) and len(held.arc):
+        _trail(world)
+    return held
+
+
+def snap(world: World, arc: float, tension_mN: float, time_s: float) -> None:
+    """The thread breaks at ``arc``."""
+    assert world.thread is not None
+    spec = world.task.scene.thread
+    assert spec is not None
+    world.pieces = break_at(world.thread, world.pieces, arc)
+    world.emit(Break, time_s, "", arc_mm=arc, tension_mN=tension_mN, limit_mN=spec.strength_mN.value)
+
+
+def thread_point(world: World, point: Array) -> tuple[float, float]:
+    """(distance, arc) in mm of the thread's point nearest to ``point`` (3,)."""
+    assert world.thread is not None
+    held = constraints(world)
+    return closest(world.thread, world.nodes, held.arc, held.position, world.pieces, point)
+
+
+def drawn(world: World) -> list[Array]:
+    """The thread's pieces as polylines (m, 3) mm, through its holes and grips."""
+    if world.thread is None:
+        return []
+    held = constraints(world)
+    return polyline(world.thread, world.nodes, held.arc, held.position, world.pieces)
+
+
+def stretch(world: World) -> float:
+    """The largest relative error of a link's length."""
+    if world.thread is None:
+        return 0.0
+    held = constraints(world)
+    return length_error(world.thread, world.nodes, held.arc, held.position, world.pieces)
+
+
+def tail_mm(world: World) -> float:
+    """Thread left before the first hole it went through; 0 when it is in none."""
+    if world.thread is None or world.needle is None:
+        return 0.0
+    arcs = [h.arc for h in world.open_holes() if h.arc > world.needle.length]
+    return world.thread.end - max(arcs) if arcs else 0.0
+
+
+def _towards_needle(held: Constraints, row: int) -> Array:
+    """Unit direction (3,) in which the thread leaves a hole towards the needle; zero where it is slack there."""
+    if row == 0:
+        return np.zeros(3)
+    way = held.position[row - 1] - held.position[row]
+    length = float(np.linalg.norm(way))
+    return unit(way) if length > 1e-9 else np.zeros(3)
+
+
+def _trail(world: World) -> None:
+    """A rigid needle at the head of a pulled thread: its tip follows its rear end, as one long link would."""
+    assert world.needle is not None
+    rear = world.nodes[0]
+    in_needle = needle_point(world.needle, world.needle.length)
+    chord = world.needle_pose.rotate(in_needle)
+    pulled = rear - world.needle_pose.position
+    axis = cross(chord, pulled)
+    sine, cosine = float(np.linalg.norm(axis)), float(chord @ pulled)
+    q = world.needle_pose.quaternion
+    if sine > 1e-12:
+        q = quaternion_multiply(quaternion_from_axis_angle(axis, math.atan2(sine, cosine)), q)
+        q = q / np.linalg.norm(q)
+    world.needle_pose = Rigid(rear - Rigid(np.zeros(3), q).rotate(in_needle), q)

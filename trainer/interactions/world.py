@@ -1,0 +1,148 @@
+"""The state that the rules of interaction share, and how a rule writes an event.
+
+A component that the task does not ask for is None. Models are frozen; what changes lives here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from trainer.anatomy.vessel import Ring, Tissue
+from trainer.curriculum import Task
+from trainer.events import Event
+from trainer.geometry import Array, Rigid, fit_rotation
+from trainer.instruments.needle import Needle
+from trainer.mechanics.equilibrium import Equilibrium
+from trainer.mechanics.thread import ThreadModel
+
+
+@dataclass(frozen=True)
+class Place:
+    """A material point of a wall: where it is in the mesh, and in the vessel's own coordinates."""
+
+    vessel: int
+    wall: str  # outer or inner
+    nodes: np.ndarray  # (3,) int32, of the whole tissue
+    weights: Array  # (3,)
+    axial_mm: float
+    clock: float  # rad
+    ring: Ring  # of the outer wall around it
+
+
+@dataclass
+class TipContact:
+    """The needle's tip pressing on a wall."""
+
+    place: Place
+    slot: int
+    inwards: bool  # pressing towards the lumen
+    stuck: bool  # False while the tip glides along the wall
+    fraction: float  # of the movement at which it began, or 0 where it began earlier
+    force_mN: float  # along the needle, at the end of the last movement
+    normal: Array  # (3,) of the undented wall, at the end of the last movement
+
+
+@dataclass
+class Hole:
+    """A hole in a wall and what goes through it."""
+
+    number: int
+    place: Place
+    slot: int
+    inwards: bool  # the way the tip went
+    pass_number: int
+    arc: float  # mm along needle and thread from the tip, of what is in the hole
+    reached_mm: float = 0.0  # how far the tip got beyond the wall
+    slid_mm: float = 0.0  # how much needle or thread ran through it in the last movement, towards the tip
+    along: Array = field(default_factory=lambda: np.zeros(3))  # (3,) direction in which it ran
+    open: bool = True  # False once needle and thread have left it, or it tore
+
+
+@dataclass
+class Jaw:
+    """One instrument's jaws and what they hold."""
+
+    pose: Rigid
+    closure: float
+    seen: bool = True
+    lost_at: float = 0.0  # time at which the device last lost the instrument
+    target: str = ""  # needle, thread, wall, or nothing
+    since: int = 0  # order of grasping; who holds the needle longest leads it
+    arc: float = 0.0  # along needle and thread from the tip
+    tool_from_needle: Rigid | None = None
+    vessel: int = -1
+    slots: tuple[int, ...] = ()
+    points: Array = field(default_factory=lambda: np.zeros((0, 3)))  # held wall, in the tool's frame
+
+
+@dataclass
+class World:
+    """Everything that a step reads and changes."""
+
+    task: Task
+    tools: tuple[str, ...]
+    world_from_scene: Rigid
+    jaws: list[Jaw]
+    tissue: Tissue | None = None
+    solver: Equilibrium | None = None
+    walls: dict[tuple[int, str], np.ndarray] = field(default_factory=dict)  # (vessel, wall) → triangles (f, 3)
+    needle: Needle | None = None
+    needle_pose: Rigid = field(default_factory=Rigid.identity)
+    thread: ThreadModel | None = None
+    nodes: Array = field(default_factory=lambda: np.zeros((0, 3)))  # of the thread
+    pieces: Array = field(default_factory=lambda: np.zeros((0, 2)))  # of the thread
+    contact: TipContact | None = None
+    holes: list[Hole] = field(default_factory=list)
+    passes: int = 0
+    before: Array = field(default_factory=lambda: np.zeros((0, 3)))  # tissue before its last movement
+    tension_mN: float = 0.0  # of the thread between two grips
+    tissue_force_mN: float = 0.0  # largest force of an instrument on tissue in the last movement
+    tick: int = 0
+    over: set[str] = field(default_factory=set)  # limits exceeded at present
+    events: list[Event] = field(default_factory=list)
+
+    def emit(self, cls: type[Event], time_s: float, tool: str, **values: Any) -> None:
+        """Write an event of this tick."""
+        self.events.append(cls(tick=self.tick, seq=len(self.events), time_s=time_s, tool=tool, **values))
+
+    def open_holes(self) -> list[Hole]:
+        return [h for h in self.holes if h.open]
+
+    def point(self, place: Place) -> Array:
+        """Where a material point is now (3,) mm."""
+        assert self.solver is not None
+        return np.asarray(place.weights @ self.solver.x[place.nodes])
+
+    def vessel_name(self, place: Place) -> str:
+        assert self.tissue is not None
+        return self.tissue.vessels[place.vessel].spec.name
+
+    def undented(self, place: Place) -> tuple[Array, Array]:
+        """The outward normal (3,) and the outer surface's point (3,) mm that the wall would have without its dent.
+
+        Both are carried from rest by the rigid motion that fits the ring of wall around the place best.
+        """
+        assert self.tissue is not None and self.solver is not None
+        vessel = self.tissue.vessels[place.vessel]
+        ring = place.ring
+        now = self.solver.x[self.tissue.nodes(place.vessel)][ring.nodes]
+        rotation = fit_rotation(ring.rest, now)
+        surface = (
+            np.asarray(vessel.spec.cut_edge_mm)
+            + place.axial_mm * vessel.axis
+            + vessel.outer_radius_mm * ring.radial
+        )
+        return rotation @ ring.radial, rotation @ (surface - ring.rest.mean(axis=0)) + now.mean(axis=0)
+
+    def needle_tool(self) -> int | None:
+        """The instrument that leads the needle: of those that hold it, the one that grasped first."""
+        holders = [i for i, j in enumerate(self.jaws) if j.target == "needle"]
+        return min(holders, key=lambda i: self.jaws[i].since) if holders else None
+
+
+def vector(a: Array) -> tuple[float, float, float]:
+    """An array (3,) as an event stores it."""
+    return (float(a[0]), float(a[1]), float(a[2]))
