@@ -23,7 +23,7 @@ def resimulate(record: SessionRecord, rows: Iterable[int] | None = None) -> list
     """
     running = scene.build(curriculum.parse_task(record.header.task_toml, record.header.task))
     found: list[Event] = []
-    for i in range(len(record.position)) if rows is None else rows:
+    for i in range(record.ticks) if rows is None else rows:
         found += running.step(
             ToolPoses(record.position[i], record.quaternion[i], record.closure[i], record.valid[i]),
         )

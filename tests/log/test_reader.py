@@ -90,6 +90,7 @@ def test_an_empty_log_says_so(tmp_path: Path) -> None:
     ("sql", "said"),
     [
         ("update inputs set data = x'0102'", "zlib|incorrect header|Error"),
+        ("delete from inputs", "tool poses of 0 ticks only, 1 were"),
         ("insert into inputs select session, 100, ticks, data from inputs", "ticks 12 to 99 are missing"),
         ("update events set kind = 'sneeze' where tick = 0", "unknown kind of event 'sneeze'"),
         ("update events set data = '{' where tick = 0", "Expecting"),

@@ -113,7 +113,7 @@ def replay(
     with opened(db) as log:
         record = reader.load(log, session)
     console = Console(stderr=True)
-    ticks = range(len(record.position))
+    ticks = range(record.ticks)
     again = resimulate(
         record, track(ticks, "replaying", console=console, transient=True, disable=not console.is_terminal)
     )
@@ -167,28 +167,32 @@ def opened(path: Path | None) -> Iterator[Database]:
 
 
 def print_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Rows under a head; never cut off where nobody looks at a screen."""
+    """Rows under a head. The first column is never broken, and nothing is where nobody looks at a screen."""
+    import sys
+
     from rich import box
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    console = Console()
-    table = Table(*head, box=box.SIMPLE_HEAD)
+    console = Console(width=None if sys.stdout.isatty() else 1000)
+    table = Table(box=box.SIMPLE_HEAD)
+    for number, title in enumerate(head):
+        table.add_column(title, no_wrap=number == 0)
     for row in rows:
         table.add_row(*map(Text, row))
-    console.print(table, width=None if console.is_terminal else console.measure(table).maximum)
+    console.print(table)
 
 
 def print_metrics(metrics: Sequence[Metric]) -> None:
     """Scores as a table, with their target bands."""
-    from trainer.cli.curricula import band
+    from trainer.reporting.wording import band
 
     rows = [
         (
             m.name,
             "nothing measured" if m.value is None else f"{m.value:.4g} {m.unit}",
-            band(m.target_low, m.target_high),
+            band(m.target_low, m.target_high, m.unit),
             m.source,
         )
         for m in metrics

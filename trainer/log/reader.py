@@ -102,6 +102,8 @@ def load(db: Database, reference: str) -> SessionRecord:
     try:
         found = tuple(events.from_row(**e) for e in stored)
         poses = _poses(blocks, len(first.tools))
+        if len(poses) < row["ticks"]:
+            raise ValueError(f"has the tool poses of {len(poses)} ticks only, {row['ticks']} were simulated")
     except (ValueError, zlib.error) as error:
         raise LogError(f"{path}: session {first.id}: {error}; `trainer db check` tells more") from error
     return SessionRecord(
