@@ -45,8 +45,15 @@ def draw_stitch(recording: Path, picture: Path, at_s: float) -> None:
             try:
                 client = _connect(viewer, port)
                 client.open(str(recording.resolve()))
+                # The title bar would show what this machine lacks, not what the recording holds.
+                title_bar = {"/top_panel": {"PanelBlueprint": {"state": "Hidden"}}}
+                shown = client.get_blueprint(of="recording").blueprint
+                client.set_blueprint(shown | title_bar, of="recording")
                 client.set_time("sim_time", duration=at_s, play_state="paused")
-                time.sleep(SETTLE_S)
+                settled = time.monotonic() + SETTLE_S
+                while time.monotonic() < settled:
+                    client.take_screenshot()  # the clock of the notice runs only while the window is drawn
+                    time.sleep(0.5)
                 picture.write_bytes(client.take_screenshot())
             except Exception as error:
                 log.seek(0)
