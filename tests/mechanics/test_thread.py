@@ -110,6 +110,26 @@ def test_taut_thread_is_straight_and_a_stretched_one_says_so() -> None:
         assert got == pytest.approx(error, abs=1e-12)
 
 
+def test_straight_thread_pushed_together_buckles_into_a_circular_arc() -> None:
+    """Length L = 2 a R, chord 2 R sin a: the sag is R (1 - cos a), here for chord = 0.9 L along a tilted line.
+
+    Links of the arc turn by 2 a / 80 = 0.02 rad each, so that the polygon differs from its circle by
+    (0.02)^2 / 8 of its size: 1e-4 of L, rounded up.
+    """
+    model = ThreadModel(LN, D, 81)
+    along = np.array([2.0, -1.0, 0.5]) / np.linalg.norm([2.0, -1.0, 0.5])
+    x = straight(model)[:, :1] * along
+    length = model.end - LN
+    points = np.array([np.zeros(3), 0.9 * length * along])
+    follow(model, x, held_at_ends(model), points, model.whole())
+    a = 0.7866830  # sin a / a = 0.9
+    sag = length / (2.0 * a) * (1.0 - np.cos(a))
+    off = x - np.outer(x @ along, along)
+    assert np.linalg.norm(off, axis=1).max() == pytest.approx(sag, abs=1e-4 * length)
+    assert np.linalg.matrix_rank(off, tol=1e-9) == 1  # in one plane
+    assert length_error(model, x, held_at_ends(model), points, model.whole()) <= EXACT
+
+
 def test_ends_to_and_fro_coincident_and_twenty_millimetres_at_once() -> None:
     """The ends oscillate through one another and through taut, then jump by 20 mm: exact at each tick."""
     model = ThreadModel(LN, D, 60)

@@ -3,8 +3,7 @@
 With unit vectors u_j and lengths l_j a span from A to B closes when sum l_j u_j = B - A. The least rotation
 that removes a small gap r is u_j + m, normalised, with one vector m for the whole span, H m = r and
 H = sum l_j (I - u_j u_j^T), a 3 x 3 system. Lengths hold by construction in every iteration; only the gap
-is driven to zero. (Least in the sum of l_j |du_j|^2: its Lagrange multiplier is m.) A projection of node
-positions on the length constraints, a tridiagonal system per iteration, would have to do without that.
+is driven to zero. (Least in the sum of l_j |du_j|^2: its Lagrange multiplier is m.)
 """
 
 from __future__ import annotations
