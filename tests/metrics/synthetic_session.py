@@ -159,6 +159,8 @@ def performed(seed: int = 0, skill: float = 0.5, **named: str) -> SessionRecord:
     places = [(0.0, 0.0, 4.0), *(tuple(rng.normal(0.0, 3.0 + 4.0 * rough, 3)) for _ in range(5)), (0.0, 0.0, 1.0)]
     ways = [reach(p, q, 2.7 * slow) for p, q in itertools.pairwise(places)]
     right = np.concatenate([hold((0.0, 0.0, 4.0), 1.0), *ways])
+    last = max(e.tick for e in events)
+    right = np.concatenate([right, hold((0.0, 0.0, 1.0), max(0, last + 1 - len(right)) / TICK_HZ)])
     right += rng.normal(0.0, 0.01, right.shape)
     left = np.concatenate([hold((0.0, 5.0, 4.0), 1.5), reach((0.0, 5.0, 4.0), (0.0, 1.0, 1.0), 2.0)])
     left = np.concatenate([left, np.tile(left[-1], (len(right) - len(left), 1))])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.metrics.synthetic_session import DRIVE, STITCH, at, pierce, pull_through, record, stitch, task_of, tilted
@@ -33,6 +33,7 @@ def driven(angles: list[float], **given: float) -> tuple[Event, ...]:
 
 
 @given(ANGLES, st.tuples(*[st.floats(-1.0, 1.0)] * 3).filter(lambda n: math.hypot(*n) > 0.1))
+@settings(deadline=None)
 def test_angle_of_a_direction_tilted_by_construction(angle: float, normal: tuple[float, float, float]) -> None:
     """A direction built at an angle to a plane measures that angle, whichever way the plane faces.
 
@@ -49,6 +50,7 @@ def test_a_vector_without_direction_has_no_angle() -> None:
 
 
 @given(st.lists(ANGLES, min_size=1, max_size=7))
+@settings(deadline=None)
 def test_entry_angle_is_the_median_and_its_error_the_mean_distance_from_upright(angles: list[float]) -> None:
     """1e-9 degrees: the built directions are good to 1e-10, see above."""
     found = scores(driven(angles), DRIVE)

@@ -16,6 +16,9 @@ from trainer.geometry import unit
 from trainer.metrics import score
 from trainer.metrics.anastomosis import rest_point
 
+#: Between the two cuts of the task's coaxial ends.
+GAP_MM = math.dist(*(v.cut_edge_mm for v in task_of().scene.vessel))
+
 
 def scores(events: tuple[Event, ...]) -> dict[str, float | None]:
     return {m.name: m.value for m in score(record(events), task_of(STITCH))}
@@ -40,10 +43,11 @@ def test_mismatch_is_the_arc_between_the_bites(a: float, b: float) -> None:
 
 @pytest.mark.parametrize(("a", "b"), [(0.0, 20.0), (100.0, 80.0), (350.0, 10.0)])
 def test_obliquity_of_a_stitch_between_two_points_of_a_cylinder(a: float, b: float) -> None:
-    """Along the axis: bites 0.35 + 0.25 and 0.4 between the cuts; across: the chord 2 R sin(20° / 2)."""
+    """Along the axis: bites 0.35 + 0.25 and the gap between the cuts; across: the chord 2 R sin(20° / 2)."""
     across = 2.0 * 0.5 * math.sin(math.radians(10.0))
+    along = 0.35 + 0.25 + GAP_MM
     found = scores(stitch(bite_a=0.35, bite_b=0.25, clock_a=a, clock_b=b))
-    assert found["obliquity_deg"] == pytest.approx(math.degrees(math.atan2(across, 1.0)))
+    assert found["obliquity_deg"] == pytest.approx(math.degrees(math.atan2(across, along)))
 
 
 def test_the_clock_runs_in_one_sense_on_both_ends() -> None:
@@ -51,7 +55,7 @@ def test_the_clock_runs_in_one_sense_on_both_ends() -> None:
     a, b = task_of().scene.vessel
     for clock in (0.0, 75.0, 200.0):
         apart = rest_point(b, 0.3, clock) - rest_point(a, 0.3, clock)
-        np.testing.assert_allclose(apart, [1.0, 0.0, 0.0], atol=1e-15)
+        np.testing.assert_allclose(apart, [0.6 + GAP_MM, 0.0, 0.0], atol=2e-15)
     assert rest_point(a, 0.0, 0.0)[2] == pytest.approx(0.5)
 
 

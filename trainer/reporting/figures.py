@@ -76,11 +76,11 @@ def strip(row: MetricRow, earlier: tuple[float, ...] = ()) -> str:
 
 def stitch_map(shown: StitchMap) -> str:
     """Looking at each cut edge, unrolled outwards: angle is the clock, distance from the inner circle the bite."""
-    size, edge, rim = 232.0, 34.0, 88.0
-    width, height = size * max(len(shown.vessels), 1), 276.0
+    size, edge, rim = 206.0, 32.0, 82.0
+    width, height = size * max(len(shown.vessels), 1), 246.0
     farthest = max([0.5, *(b.bite_mm for b in shown.bites), *(m.bite_mm for m in shown.marks)])
     rings = ticks(0.0, farthest, 3)
-    centres = {v: (size * (i + 0.5), 132.0) for i, v in enumerate(shown.vessels)}
+    centres = {v: (size * (i + 0.5), 106.0) for i, v in enumerate(shown.vessels)}
 
     def place(vessel: str, clock_deg: float, bite_mm: float) -> tuple[float, float]:
         radius = edge + (rim - edge) * max(bite_mm, 0.0) / rings[-1]
@@ -158,10 +158,9 @@ def _error_legend(x: float, y: float) -> str:
 
 def angle_histogram(shown: Histogram) -> str:
     """Entry angles from 0 to 90 degrees with the target band behind."""
-    width, height, left, right, top, bottom = 280.0, 190.0, 30.0, 8.0, 12.0, 40.0
+    width, height, left, right, top, bottom = 246.0, 246.0, 24.0, 8.0, 20.0, 52.0
     most = max(shown.counts, default=0)
-    scale = ticks(0.0, max(most, 2), 4)
-    scale = [s for s in scale if s == int(s)]
+    scale = [s for s in ticks(0.0, max(most, 4), 4) if s == int(s)]
 
     def x(angle: float) -> float:
         return left + (width - left - right) * angle / 90.0
@@ -173,7 +172,7 @@ def angle_histogram(shown: Histogram) -> str:
     if shown.target_low is not None or shown.target_high is not None:
         low, high = shown.target_low or 0.0, 90.0 if shown.target_high is None else shown.target_high
         parts.append(element("rect", x=x(low), y=top, width=x(high) - x(low), height=height - top - bottom, fill=BAND))
-        parts.append(text(x(0.5 * (low + high)), top + 9, "target", font_size=8.5, fill=BAND_EDGE,
+        parts.append(text(x(0.5 * (low + high)), top - 5, "target", font_size=8.5, fill=BAND_EDGE,
                           text_anchor="middle"))  # fmt: skip
     for s in scale:
         parts.append(line(left, y(s), width - right, y(s), stroke=LINE, stroke_width=0.6))
@@ -186,14 +185,14 @@ def angle_histogram(shown: Histogram) -> str:
     for angle in range(0, 91, 15):
         parts.append(line(x(angle), y(0), x(angle), y(0) + 3, stroke=INK, stroke_width=0.8))
         parts.append(text(x(angle), y(0) + 13, f"{angle}°", font_size=9, fill=GREY, text_anchor="middle"))
-    parts.append(text(0.5 * (left + width), height - 8, "angle to the wall at entry (90° is upright)", font_size=9,
+    parts.append(text(0.5 * (left + width), height - 22, "angle to the wall at entry (90° is upright)", font_size=9,
                       fill=GREY, text_anchor="middle"))  # fmt: skip
     return drawing(width, height, *parts, label="Histogram of the entry angles")
 
 
 def learning_curve(curve: Curve, attempts: int) -> str:
     """A value over attempts: each attempt, the median of the last three, and Theil and Sen's line."""
-    width, height, left, right, top, bottom = 330.0, 190.0, 40.0, 12.0, 12.0, 38.0
+    width, height, left, right, top, bottom = 320.0, 190.0, 34.0, 8.0, 12.0, 38.0
     scale = ticks(0.0, max([1e-9, *curve.values]), 4)
     last = max(attempts, 5)
 

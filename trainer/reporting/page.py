@@ -16,6 +16,7 @@ from trainer.data_files import data_folder
 from trainer.reporting import figures, wording
 from trainer.reporting.progress import Attempt, Curve, ProgressReport, ProgressRow, TaskProgress
 from trainer.reporting.session import EventLine, MetricRow, SessionReport, StitchMap
+from trainer.reporting.summary import curve_words, session_summary, task_summary
 
 MAP_CAPTION = (
     "Each vessel end around its cut edge, 3 o'clock on the same side of both. Distance from the inner circle is the "
@@ -30,13 +31,14 @@ class Sources:
         self.listed: list[str] = []
 
     def cite(self, row: MetricRow) -> str:
-        """The reference to a row's source, as a superscript."""
+        """The reference to a row's source, and whether it is only assumed."""
         if not row.source:
             return ""
         if row.source not in self.listed:
             self.listed.append(row.source)
         number = self.listed.index(row.source) + 1
-        return f'<sup><a href="#source-{number}">{number}</a></sup>'
+        assumed = " assumed" if row.assumed else ""
+        return f'<a href="#source-{number}">[{number}]</a>{assumed}'
 
     def footnotes(self) -> str:
         items = [f'<li id="source-{i}">{escape(s)}</li>' for i, s in enumerate(self.listed, 1)]
@@ -92,39 +94,6 @@ def progress_page(report: ProgressReport) -> str:
     )
 
 
-def session_summary(report: SessionReport) -> str:
-    """How many targets were met, and which were missed."""
-    measured = sum(row.met is not None for row in report.targets)
-    first = f"{report.met} of {len(report.targets)} targets met"
-    first += "." if measured == len(report.targets) else f"; {len(report.targets) - measured} could not be measured."
-    missed = [
-        f"{r.title.lower()} {wording.quantity(r.value, r.unit)} ({wording.band(r.target_low, r.target_high, r.unit)})"
-        for r in report.missed
-    ]
-    return f"{first} Outside: {', '.join(missed)}." if missed else first
-
-
-def task_summary(task: TaskProgress) -> str:
-    """Attempts and how the last one stands against the targets."""
-    rows = [r.last for r in task.rows if r.last.has_target]
-    met = sum(r.met is True for r in rows)
-    tried = f"{len(task.attempts)} attempt{'s' if len(task.attempts) != 1 else ''}, {task.completed} completed."
-    return f"{tried} The last one met {met} of {len(rows)} targets."
-
-
-def curve_words(curve: Curve) -> str:
-    """What the attempts so far can tell."""
-    if curve.recent is None:
-        return "No completed attempt."
-    said = f"Median of the last {min(3, len(curve.values))}: {wording.quantity(curve.recent, curve.unit)}."
-    if curve.trend is None:
-        return said + " Three completed attempts are needed for a slope."
-    unit = wording.unit_word(curve.unit)
-    gap = "" if unit == "°" else " "
-    t = curve.trend
-    return said + f" Slope {t.slope:+.1f}{gap}{unit} per attempt (95 %: {t.low:+.1f} to {t.high:+.1f})."
-
-
 def _template(name: str) -> Template:
     return Template(read_text(data_folder("reports") / "templates" / name))
 
@@ -159,8 +128,11 @@ def _verdict(row: MetricRow) -> str:
 
 
 def _target_table(rows: tuple[MetricRow, ...], sources: Sources) -> str:
-    head = (("Measure", ""), ("Value", "n"), ("", ""), ("Target", ""), ("", ""))
-    return _table(head, ([_named(r), _value(r), figures.strip(r), _target(r, sources), _verdict(r)] for r in rows))
+    head = (("Measure", ""), ("Value", "n"), ("", ""), ("Target", ""), ("Source", "quiet"), ("", ""))
+    return _table(
+        head,
+        ([_named(r), _value(r), figures.strip(r), _target(r), sources.cite(r), _verdict(r)] for r in rows),
+    )
 
 
 def _named(row: MetricRow) -> str:
@@ -171,9 +143,10 @@ def _value(row: MetricRow) -> str:
     return f"<strong>{escape(wording.quantity(row.value, row.unit))}</strong>"
 
 
-def _target(row: MetricRow, sources: Sources) -> str:
-    assumed = ' <span class="quiet">assumed</span>' if row.assumed else ""
-    return escape(wording.band(row.target_low, row.target_high, row.unit)) + assumed + sources.cite(row)
+def _target(row: MetricRow) -> str:
+    if not row.has_target:
+        return '<span class="quiet">no target</span>'
+    return escape(wording.band(row.target_low, row.target_high, row.unit))
 
 
 def _other_groups(rows: tuple[MetricRow, ...]) -> str:
@@ -241,15 +214,16 @@ def _task_section(task: TaskProgress, sources: Sources) -> str:
 
 
 def _progress_table(rows: tuple[ProgressRow, ...], sources: Sources) -> str:
-    head = (("Measure", ""), ("Last", "n"), ("Best", "n"), ("Last and five before", ""), ("Target", ""), ("", ""))
+    kinds = {"Measure": "", "Last": "n", "Best": "n", "Last and five before": "", "Target": "", "Source": "quiet"}
+    head = (*kinds.items(), ("", ""))
 
     def cells(row: ProgressRow) -> list[str]:
         attempt = f' <span class="quiet">#{row.best_attempt}</span>' if row.best_attempt is not None else ""
         best = escape(wording.quantity(row.best, row.last.unit)) + attempt
         shown = row.last.has_target
         strip = figures.strip(row.last, row.earlier) if shown else ""
-        target = _target(row.last, sources) if shown else '<span class="quiet">no target</span>'
-        return [_named(row.last), _value(row.last), best, strip, target, _verdict(row.last) if shown else ""]
+        source, verdict = (sources.cite(row.last), _verdict(row.last)) if shown else ("", "")
+        return [_named(row.last), _value(row.last), best, strip, _target(row.last), source, verdict]
 
     return _table(head, map(cells, rows))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from datetime import datetime
 
 from trainer.events import (
@@ -23,6 +24,7 @@ from trainer.events import (
     TrackingBack,
     TrackingLost,
     Withdraw,
+    payload,
 )
 
 DISCLAIMER = "Training feedback, not a certificate."
@@ -33,7 +35,7 @@ _UNIT_WORDS = {"deg": "°", "count": "", "ratio": ""}
 
 def title(metric: str) -> str:
     """A metric's name for a reader: without its unit and with spaces."""
-    for suffix in ("_deg", "_mm", "_s", "_mN", "_count"):
+    for suffix in ("_deg", "_mm", "_s", "_mN"):
         metric = metric.removesuffix(suffix)
     words = metric.replace("_", " ")
     return words[:1].upper() + words[1:]
@@ -72,9 +74,9 @@ def band(low: float | None, high: float | None, unit: str) -> str:
 
 
 def date(started_at: str) -> str:
-    """The day and hour of an ISO 8601 time, in UTC as the log keeps it."""
-    moment = datetime.fromisoformat(started_at)
-    return f"{moment.day} {moment:%B %Y, %H:%M} UTC"
+    """The day and hour of an ISO 8601 time, by the clock of the reader's machine."""
+    moment = datetime.fromisoformat(started_at).astimezone()
+    return f"{moment.day} {moment:%B %Y, %H:%M}"
 
 
 def duration(seconds: float) -> str:
@@ -96,7 +98,7 @@ def _held(target: str, body: str) -> str:
 
 
 def describe(event: Event) -> str:
-    """What happened, in a few words. Raises TypeError for a kind that has no words."""
+    """What happened, in a few words; the bare fields of a kind that has no words of its own."""
     match event:
         case Grasp():
             return f"{_held(event.target, event.body)}, {event.force_mN:.0f} mN"
@@ -135,4 +137,5 @@ def describe(event: Event) -> str:
             return event.step
         case TaskDone():
             return f"{event.outcome}: {event.reason}" if event.reason else event.outcome
-    raise TypeError(f"no words for an event of kind {event.kind!r}")
+        case _:
+            return ", ".join(str(v) for v in json.loads(payload(event)).values())

@@ -1,0 +1,198 @@
+"""What the report of a session says, and that its page stands alone and is well formed."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import re
+from xml.etree import ElementTree
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rich.console import Console
+
+from tests.metrics.synthetic_session import DRIVE, at, performed, pierce, record, stitch, task_of
+from tests.metrics.synthetic_session import withdraw as withdrawn
+from trainer.events import KINDS, Aborted, Contact, Overforce, TickOverrun, TrackingBack, TrackingLost
+from trainer.reporting import figures, terminal, wording
+from trainer.reporting.page import session_page
+from trainer.reporting.session import MetricRow, SessionReport, event_lines, session_report
+from trainer.reporting.summary import session_summary
+
+
+def report(**bites: float) -> SessionReport:
+    return session_report(record(stitch(**bites)), task_of())
+
+
+def row(value: float | None, low: float | None, high: float | None, unit: str = "mm") -> MetricRow:
+    return MetricRow("bite_A_mm", "Bite A", "Needle", "What.", value, unit, low, high, "assumed", "1")
+
+
+def svg_of(page: str) -> list[ElementTree.Element]:
+    return [ElementTree.fromstring(found) for found in re.findall(r"<svg.*?</svg>", page, re.DOTALL)]
+
+
+@pytest.mark.parametrize(
+    ("value", "low", "high", "met"),
+    [
+        (1.0, 1.0, 2.0, True), (2.0, 1.0, 2.0, True), (2.1, 1.0, 2.0, False), (0.9, 1.0, None, False),
+        (9.0, 1.0, None, True), (0.0, 0.0, 0.0, True), (None, 0.0, 1.0, None), (5.0, None, None, None),
+    ],
+)  # fmt: skip
+def test_a_target_is_a_closed_band(
+    value: float | None, low: float | None, high: float | None, met: bool | None
+) -> None:
+    assert row(value, low, high).met is met
+
+
+def test_targets_and_other_metrics_are_apart_and_complete() -> None:
+    found = report()
+    wanted = {t.name for t in task_of().metric if t.low is not None or t.high is not None}
+    assert {r.name for r in found.targets} == wanted
+    assert not {r.name for r in found.targets} & {r.name for r in found.others}
+    assert {r.family for r in (*found.targets, *found.others)} == {"Needle", "Stitch", "Motion", "Handling"}
+
+
+def test_the_summary_counts_what_was_met_and_names_what_was_missed() -> None:
+    found = report(bite_a=0.3, bite_b=0.5, angle=60.0)
+    said = session_summary(found)
+    assert said.startswith(f"{found.met} of {len(found.targets)} targets met.")
+    assert "entry angle 60.0° (70 to 90°)" in said
+    assert "bite asymmetry 0.50 (0 to 0.25)" in said
+    assert "Outside" not in session_summary(report())
+
+
+def test_the_map_holds_each_outer_hole_its_mark_and_the_stitch() -> None:
+    shown = report(bite_a=0.3, clock_a=350.0, angle=70.0).stitch_map
+    assert shown.vessels == ("A", "B")
+    assert [(b.vessel, b.clock_deg, b.bite_mm) for b in shown.bites] == [("A", 350.0, 0.3), ("B", 0.0, 0.35)]
+    assert shown.bites[0].angle_error_deg == pytest.approx(20.0)
+    assert {(m.vessel, m.clock_deg, m.bite_mm) for m in shown.marks} == {("A", 0.0, 0.35), ("B", 0.0, 0.35)}
+    assert shown.stitches == ((shown.bites[0], shown.bites[1]),)
+
+
+def test_a_hole_left_again_is_told_from_one_that_holds() -> None:
+    p = pierce(10)
+    found = session_report(record((p, withdrawn(50, p)), reference=DRIVE), task_of(DRIVE))
+    assert [b.kept for b in found.stitch_map.bites] == [False]
+
+
+@given(st.lists(st.floats(0.0, 90.0), max_size=12))
+@settings(deadline=None)
+def test_the_histogram_counts_each_pass_once(angles: list[float]) -> None:
+    events = tuple(pierce(10 * i, pass_number=i, angle=a) for i, a in enumerate(angles))
+    shown = session_report(record(events, reference=DRIVE), task_of(DRIVE)).histogram
+    assert len(shown.counts) == 18
+    assert sum(shown.counts) == len(angles)
+
+
+def test_upright_is_in_the_last_bin() -> None:
+    assert report().histogram.counts[-1] == 1
+
+
+def test_events_alike_are_one_line_and_late_ticks_none() -> None:
+    late = tuple(TickOverrun(**at(i), work_ms=12.0, slot_ms=10.0) for i in range(3))
+    lost = tuple(TrackingLost(**at(10 + i)) for i in range(4))
+    back = TrackingBack(**at(20), lost_s=0.5)
+    lines = event_lines((*late, *lost, back))
+    assert [(e.kind, e.count) for e in lines] == [("tracking_lost", 4), ("tracking_back", 1)]
+    assert session_report(record(late), task_of()).overruns == 3
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_of_event_has_words(kind: str) -> None:
+    """Built with a text or number in each field, so that a new kind is tested by existing."""
+    cls = KINDS[kind]
+    by_type = {"int": 1, "float": 1.0, "str": "word", "Vector": (0.0, 0.0, 1.0)}
+    values = {f.name: by_type[str(f.type)] for f in dataclasses.fields(cls)}
+    assert wording.describe(cls(**values)).strip()
+
+
+def test_words_for_what_a_supervisor_looks_for() -> None:
+    here = (0.0, 0.0, 0.0)
+    touch = Contact(**at(1), body="A", wall="outer", direction="in", point=here, axial_mm=0.3, clock_deg=30.0)
+    assert wording.describe(touch) == "outer wall of A, 0.30 mm from the cut at 30°"
+    pull = Overforce(**at(1), body="A", quantity="tissue_pull", value=80.0, limit=60.0, unit="mN")
+    assert wording.describe(pull) == "tissue pull on A: 80 mN, limit 60 mN"
+    assert wording.describe(Aborted(**at(1), reason="by hand")) == "by hand"
+
+
+def test_the_page_stands_alone() -> None:
+    page = session_page(report())
+    assert not re.search(r"""(src|href)=["'](?!#)|@import|url\(|<script""", page)
+    assert "$" not in re.sub(r"<style>.*?</style>", "", page, flags=re.DOTALL)
+    assert wording.DISCLAIMER in page
+    assert "assumed: bites of equal size" in page
+
+
+def test_names_from_people_are_escaped_everywhere() -> None:
+    nasty = "<script>alert('x')</script>&\"$x"
+    made = record(stitch(), trainee=nasty, session="<b>")
+    page = session_page(session_report(made, dataclasses.replace(task_of(), title="A <i>task</i> & \"more\"")))
+    assert "<script" not in page
+    assert "<b>" not in page
+    assert "<i>" not in page
+    assert "&lt;script&gt;alert(&#x27;x&#x27;)&lt;/script&gt;&amp;&quot;$x" in page
+
+
+@pytest.mark.parametrize("reference", ["anastomosis/single-stitch", DRIVE])
+@pytest.mark.parametrize("empty", [True, False])
+def test_figures_are_well_formed_and_inside_their_frame(reference: str, empty: bool) -> None:
+    events = () if empty else stitch(bite_a=1.9, clock_a=123.0, angle=3.0)
+    page = session_page(session_report(record(events, reference=reference), task_of(reference)))
+    drawings = svg_of(page)
+    assert len(drawings) >= 2
+    for drawing in drawings:
+        _, _, width, height = (float(v) for v in drawing.attrib["viewBox"].split())
+        for circle in drawing.iter("{http://www.w3.org/2000/svg}circle"):
+            assert 0.0 <= float(circle.attrib["cx"]) <= width
+            assert 0.0 <= float(circle.attrib["cy"]) <= height
+
+
+def test_a_dot_lies_at_its_clock_angle_and_bite() -> None:
+    """Twelve o'clock is up and three to the right; twice the bite is twice as far beyond the cut edge's circle."""
+    faces = {}
+    for clock, bite in ((0.0, 0.25), (0.0, 0.5), (90.0, 0.5)):
+        made = record((pierce(10, clock_deg=clock, axial_mm=bite),), reference=DRIVE)
+        drawing = svg_of(figures.stitch_map(session_report(made, task_of(DRIVE)).stitch_map))[0]
+        circles = drawing.findall("{http://www.w3.org/2000/svg}g/{http://www.w3.org/2000/svg}circle")
+        edge = next(c for c in drawing.iter("{http://www.w3.org/2000/svg}circle") if c.attrib["r"] == "32")
+        dx = float(circles[-1].attrib["cx"]) - float(edge.attrib["cx"])
+        dy = float(circles[-1].attrib["cy"]) - float(edge.attrib["cy"])
+        faces[clock, bite] = (dx, dy)
+    assert faces[0.0, 0.5][0] == pytest.approx(0.0, abs=0.01)
+    assert -faces[0.0, 0.5][1] - 32.0 == pytest.approx(2.0 * (-faces[0.0, 0.25][1] - 32.0), abs=0.02)
+    assert faces[90.0, 0.5] == pytest.approx((-faces[0.0, 0.5][1], 0.0), abs=0.01)
+
+
+def test_the_strip_places_the_value_on_its_scale() -> None:
+    """Angles run from 0 to 90 degrees over 7 … 143: 45 degrees is the middle, 75."""
+    inside = svg_of(figures.strip(row(45.0, 30.0, 60.0, "deg")))[0]
+    dot = inside.find("{http://www.w3.org/2000/svg}circle")
+    assert dot is not None
+    assert float(dot.attrib["cx"]) == pytest.approx(75.0)
+    outside = svg_of(figures.strip(row(10.0, 30.0, 60.0, "deg")))[0]
+    assert outside.find("{http://www.w3.org/2000/svg}polygon") is not None
+
+
+def test_the_report_is_json() -> None:
+    assert json.loads(json.dumps(dataclasses.asdict(report()), allow_nan=False))["outcome"] == "completed"
+
+
+def test_the_terminal_tells_the_same() -> None:
+    console = Console(record=True, width=100, file=io.StringIO())
+    made = session_report(performed(seed=3, skill=0.3, trainee="[bold]Ada[/bold]"), task_of())
+    terminal.print_session(made, console)
+    said = console.export_text()
+    assert "[bold]Ada[/bold]" in said
+    assert wording.DISCLAIMER in said
+    for r in made.targets:
+        assert wording.quantity(r.value, r.unit) in said
+
+
+def test_the_terminals_strip_marks_value_and_band() -> None:
+    """90 degrees over 20 cells: 4.5 degrees each."""
+    assert terminal.strip(row(45.0, 36.0, 54.0, "deg")) == "········━━●━━·······"
+    assert terminal.strip(row(0.0, 36.0, 54.0, "deg")).startswith("◆·······━")

@@ -1,0 +1,101 @@
+"""Sessions as four tidy CSV files: sessions, events, metrics and poses, with units in the columns' names.
+
+One row is one thing (a session, an event, a score, a tool at a tick), so that R, pandas and a spreadsheet
+read them as they are. Numbers are written so that they read back exactly; an empty cell is a missing value.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+from trainer.curriculum import parse_task
+from trainer.events import payload
+from trainer.log.record import SessionRecord
+from trainer.metrics import score
+
+
+class ExportError(ValueError):
+    """An export that cannot be written; one line with the folder and the fix."""
+
+
+SESSIONS = (
+    "session", "trainee", "task", "task_sha256", "device", "seed", "started_at", "status", "outcome", "ticks",
+    "tick_hz", "duration_s", "trainer_version",
+)  # fmt: skip
+EVENTS = ("session", "tick", "seq", "time_s", "tool", "kind", "data_json")
+METRICS = ("session", "metric", "value", "unit", "target_low", "target_high", "source", "version")
+POSES = ("session", "tick", "time_s", "tool", "x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz", "closure", "valid")
+
+Row = tuple[Any, ...]
+
+
+def session_rows(record: SessionRecord) -> Iterator[Row]:
+    """One row: who did what when, and how it ended."""
+    h = record.header
+    yield (
+        h.id, h.trainee, h.task, h.task_sha256, h.device, h.seed, h.started_at, record.status, record.outcome,
+        record.ticks, h.tick_hz, record.duration_s, h.versions.get("trainer", ""),
+    )  # fmt: skip
+
+
+def event_rows(record: SessionRecord) -> Iterator[Row]:
+    """One row an event; the fields of its kind are a JSON object."""
+    for e in record.events:
+        yield record.header.id, e.tick, e.seq, e.time_s, e.tool, e.kind, payload(e)
+
+
+def metric_rows(record: SessionRecord) -> Iterator[Row]:
+    """One row a score, computed from the record. Raises ConfigError for a task that cannot be read."""
+    for m in score(record, parse_task(record.header.task_toml, record.header.task)):
+        yield record.header.id, m.name, m.value, m.unit, m.target_low, m.target_high, m.source, m.version
+
+
+def pose_rows(record: SessionRecord) -> Iterator[Row]:
+    """One row a tool and tick; ``valid`` is 0 where the device did not see the tool."""
+    h = record.header
+    position, quaternion = record.position.tolist(), record.quaternion.tolist()
+    closure, valid = record.closure.tolist(), record.valid.tolist()
+    for i in range(len(position)):
+        tick = record.first_tick + i
+        for k, tool in enumerate(h.tools):
+            numbers = (*position[i][k], *quaternion[i][k], closure[i][k])
+            yield h.id, tick, tick / h.tick_hz, tool, *numbers, int(valid[i][k])
+
+
+FILES: dict[str, tuple[tuple[str, ...], Callable[[SessionRecord], Iterator[Row]]]] = {
+    "sessions.csv": (SESSIONS, session_rows),
+    "events.csv": (EVENTS, event_rows),
+    "metrics.csv": (METRICS, metric_rows),
+    "poses.csv": (POSES, pose_rows),
+}
+
+
+def write(records: Iterable[SessionRecord], folder: Path) -> dict[str, int]:
+    """Write all files into a new or empty folder; returns the rows of each, without headings.
+
+    Records are taken one at a time. Raises ExportError where the folder holds something or is a file,
+    OSError where it cannot be written.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise ExportError(f"{folder}: is a file; name a folder with --out")
+    if folder.is_dir() and any(folder.iterdir()):
+        raise ExportError(f"{folder}: is not empty; nothing is overwritten, name a new folder with --out")
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = dict.fromkeys(FILES, 0)
+    files = {name: (folder / name).open("w", encoding="utf-8", newline="") for name in FILES}
+    try:
+        writers = {name: csv.writer(file, lineterminator="\n") for name, file in files.items()}
+        for name, (columns, _) in FILES.items():
+            writers[name].writerow(columns)
+        for record in records:
+            for name, (_, rows_of) in FILES.items():
+                for row in rows_of(record):
+                    writers[name].writerow(row)
+                    rows[name] += 1
+    finally:
+        for file in files.values():
+            file.close()
+    return rows
