@@ -39,19 +39,18 @@ class FakeScene:
 
     def step(self, given: ToolPoses) -> tuple[Event, ...]:
         self.given.append(given)
-        event = StepDone(self.tick, 0, 0.01 * self.tick, "", step="x", index=self.tick)
+        events: tuple[Event, ...] = (StepDone(self.tick, 0, 0.01 * self.tick, "", step="x", index=self.tick),)
+        if self.tick + 1 == self._ticks:
+            events = (*events, self._done("completed", "all steps", seq=1))
         self.tick += 1
-        if self.tick == self._ticks:
-            return (event, self._done("completed", "all steps", seq=1))
-        return (event,)
+        return events
 
     def finish(self, outcome: str, reason: str) -> tuple[Event, ...]:
-        return (self._done(outcome, reason, seq=5),)
+        return (self._done(outcome, reason, seq=0),)
 
     def _done(self, outcome: str, reason: str, seq: int) -> TaskDone:
         self.outcome = outcome
-        tick = max(self.tick - 1, 0)
-        return TaskDone(tick, seq, 0.01 * tick, "", outcome, reason, NOWHERE, NOWHERE, NOWHERE, 0.0, 0.0, 0.0)
+        return TaskDone(self.tick, seq, 0.01 * self.tick, "", outcome, reason, NOWHERE, NOWHERE, NOWHERE, 0.0, 0.0, 0.0)
 
     def view(self) -> str:
         return f"view at {self.tick}"

@@ -97,6 +97,9 @@ def _print_family(family: Family) -> None:
 
 
 def _print_task(reference: str, task: Task) -> None:
+    from trainer.metrics.registry import definition_of
+    from trainer.reporting import wording
+
     print(f"{reference}: {task.title}\n{task.summary}")
     print(f"Ends after {task.time_limit_s:g} s at most; {task.tick_hz:g} ticks per second.")
     print("\nSteps")
@@ -107,7 +110,8 @@ def _print_task(reference: str, task: Task) -> None:
         print(f"  {name}: {limit.value:g} {limit.unit}  [{limit.source}]")
     print("\nMeasured")
     for metric in task.metric:
-        print(f"  {metric.name}: {band(metric.low, metric.high)}  [{metric.source}]")
+        target = wording.band(metric.low, metric.high, definition_of(metric.name, task).unit) or "no target"
+        print(f"  {metric.name}: {target}  [{metric.source}]")
     print("\nScene")
     scene = task.scene
     for vessel in scene.vessel:
@@ -132,14 +136,3 @@ def _print_component(title: str, component: Any) -> None:
             print(f"    {field.name} = {value.value:g}  [{value.source}]")
         else:
             print(f"    {field.name} = {value}")
-
-
-def band(low: float | None, high: float | None) -> str:
-    """A target band in words."""
-    if low is None and high is None:
-        return "no target"
-    if low is None:
-        return f"at most {high:g}"
-    if high is None:
-        return f"at least {low:g}"
-    return f"{low:g}" if low == high else f"{low:g} to {high:g}"

@@ -49,7 +49,7 @@ def build_app() -> typer.Typer:
     """The command line with all its sub-commands."""
     import typer
 
-    from trainer.cli import curricula, db, devices, sessions
+    from trainer.cli import curricula, db, devices, export, report, sessions
     from trainer.cli.practice import practice
     from trainer.cli.warmup import warmup
 
@@ -64,6 +64,8 @@ def build_app() -> typer.Typer:
     app.command()(practice)
     app.add_typer(curricula.app, name="curricula")
     app.add_typer(sessions.app, name="sessions")
+    app.add_typer(report.app, name="report")
+    app.add_typer(export.app, name="export")
     app.add_typer(devices.app, name="devices")
     app.add_typer(db.app, name="db")
     app.command()(warmup)

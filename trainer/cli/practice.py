@@ -46,14 +46,15 @@ def practice(
     session_id = new_session_id()
     log_path = db or default_db_path()
     recording = None if no_record else record or log_path.parent / "recordings" / f"{session_id}.rrd"
+    task_file = load_task(task)
     with ExitStack() as stack:
-        result = _perform(stack, load_task(task), session_id, trainee, device, seed, realtime, log_path, recording)
+        result = _perform(stack, task_file, session_id, trainee, device, seed, realtime, log_path, recording)
         if as_json:
             print(json.dumps(result, indent=2, allow_nan=False))
         else:
             from trainer.cli.scores import print_result
 
-            print_result(result)
+            print_result(result, task_file.task)
     # A recording that could not be finished says so here, when everything else is stored and printed.
 
 

@@ -29,17 +29,24 @@ def warmup() -> None:
 def announce() -> None:
     """Say so on stderr when no kernel has been compiled yet: the first session waits for it."""
     if not any(Path(os.environ["NUMBA_CACHE_DIR"]).rglob("*.nbi")):
-        typer.echo("compiling kernels once, which takes about a minute…", err=True)
+        typer.echo("compiling kernels once, which takes up to a minute…", err=True)
 
 
 def warm_up(task: Task) -> None:
-    """Run ``task`` with a scripted hand and no sinks, so that every kernel is in memory when the clock starts."""
+    """Perform ``task`` with no sinks, so that every kernel is in memory when the clock starts.
+
+    Kernels are compiled for types and not for sizes: a coarse mesh, long ticks and a hasty hand meet all of them
+    in a second or two, whatever becomes of the stitch.
+    """
+    from dataclasses import replace
+
     from trainer.clock import Fast
-    from trainer.drivers import open_driver
+    from trainer.drivers.scripted import ScriptedHands
+    from trainer.profile import Hand
     from trainer.scene import build
     from trainer.session import run
 
-    scene = build(task)
-    _, driver = open_driver("scripted-expert", task, scene.home, seed=0)
-    run(scene, driver, [], Fast(task.tick_hz))
-    driver.close()
+    vessels = tuple(replace(vessel, layers=9, around=8) for vessel in task.scene.vessel)
+    coarse = replace(task, scene=replace(task.scene, vessel=vessels), tick_hz=20.0)
+    scene = build(coarse)
+    run(scene, ScriptedHands(Hand(speed_mm_s=30.0), coarse, scene.home, seed=0), [], Fast(coarse.tick_hz))
