@@ -108,7 +108,7 @@ def test_material_coordinates_across_twelve_o_clock(vessel: Vessel) -> None:
 
 
 def test_wall_point_outside_is_refused(vessel: Vessel) -> None:
-    with pytest.raises(ValueError, match="between 0 and 2, found 2.1"):
+    with pytest.raises(ValueError, match=r"between 0 and 2, found 2\.1"):
         wall_point(vessel, 0.0, 2.1, "outer")
 
 

@@ -110,8 +110,8 @@ def build(spec: VesselSpec) -> Vessel:
         axis=axis,
         twelve=twelve,
         three=three,
-        axial_mm=axial,
-        clock=clock,
+        axial_mm=axial.astype(np.float64),
+        clock=clock.astype(np.float64),
         outer_triangles=outer,
         inner_triangles=inner,
         cut_triangles=cut,
@@ -163,7 +163,8 @@ def wall_point(vessel: Vessel, clock: float, axial_mm: float, hull: Hull) -> tup
     if (i + j + h) % 2 == 0:  # the diagonal joins a and c
         nodes, weights = ((a, b, c), (1.0 - u, u - w, w)) if u >= w else ((a, c, d), (1.0 - w, u, w - u))
     else:
-        nodes, weights = ((a, b, d), (1.0 - u - w, u, w)) if u + w <= 1.0 else ((b, c, d), (1.0 - w, u + w - 1.0, 1.0 - u))
+        near = u + w <= 1.0
+        nodes, weights = ((a, b, d), (1.0 - u - w, u, w)) if near else ((b, c, d), (1.0 - w, u + w - 1.0, 1.0 - u))
     return np.array(nodes, dtype=np.int32), np.array(weights)
 
 
@@ -233,7 +234,7 @@ def node_normals(x: Array, triangles: np.ndarray) -> Array:
     for k in range(3):
         np.add.at(total, triangles[:, k], face)
     length = np.linalg.norm(total, axis=1, keepdims=True)
-    return np.divide(total, length, out=np.zeros_like(total), where=length > 0.0)
+    return np.asarray(np.divide(total, length, out=np.zeros_like(total), where=length > 0.0))
 
 
 def _tetrahedra(layers: int, around: int) -> np.ndarray:
@@ -246,7 +247,7 @@ def _tetrahedra(layers: int, around: int) -> np.ndarray:
     cells = []
     for i in range(layers - 1):
         for j in range(around):
-            at = corner + (i, 0, j)
+            at = corner + np.array([i, 0, j])
             index = (at[:, 0] * 2 + at[:, 1]) * around + at[:, 2] % around
             odd = at.sum(axis=1) % 2 == 1
             even = index[~odd]
@@ -281,7 +282,7 @@ def _ring_triangles(i: int, around: int, forwards: bool) -> np.ndarray:
 
 
 def _elimination(layers: int, around: int) -> np.ndarray:
-    """The free nodes (f,) int32 layer by layer, zigzag around the circle: 0, 1, -1, 2, -2 …, both hulls of a j together.
+    """The free nodes (f,) int32 layer by layer, zigzag around the circle: 0, 1, -1, 2, -2 …, both hulls together.
 
     Neighbours around are then two places apart instead of a whole circle, and the band is little wider than a layer.
     """

@@ -19,6 +19,9 @@ from numba import njit
 
 from trainer.geometry import Array
 
+#: A pivot below this share of the diagonal is lost in rounding: the matrix is singular, or not positive definite.
+SINGULAR = 1e-9
+
 
 @dataclass(frozen=True)
 class BandedFactor:
@@ -51,17 +54,29 @@ def assemble_band(blocks: Array, links: np.ndarray, place: np.ndarray, band: Arr
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def factor_band(band: Array, columns: np.ndarray, rows: np.ndarray, inverse: Array) -> bool:
-    """L D Lᵀ of ``band`` (overwritten), L with unit diagonal; False when a pivot is not positive.
+def factor_band(
+    band: Array,
+    diagonal: Array,
+    columns: np.ndarray,
+    rows: np.ndarray,
+    inverse: Array,
+    first: int,
+    last: int,
+) -> int:
+    """L D Lᵀ of ``band`` (overwritten), L with unit diagonal: the columns ``first`` … ``last`` - 1, given those before.
 
-    ``columns[j, k]`` is L[j + 1 + k, j], ``rows[j, k]`` is L[j, j - b + k], ``inverse[j]`` is 1 / D[j].
+    ``columns[j, k]`` is L[j + 1 + k, j], ``rows[j, k]`` is L[j, j - b + k], ``inverse[j]`` is 1 / D[j]. A pivot that
+    is not a SINGULAR share of ``diagonal`` (3 f,), the band's own before, is replaced by it, which makes the factor
+    that of a stiffer, positive definite matrix. Returns how often that was done.
     """
     n, width = band.shape
     b = width - 1
-    for j in range(n):
+    replaced = 0
+    for j in range(first, last):
         pivot = band[j, 0]
-        if not pivot > 0.0:
-            return False
+        if not pivot > SINGULAR * diagonal[j]:
+            pivot = diagonal[j]
+            replaced += 1
         inverse[j] = 1.0 / pivot
         reach = min(b, n - 1 - j)
         for k in range(1, reach + 1):
@@ -72,7 +87,7 @@ def factor_band(band: Array, columns: np.ndarray, rows: np.ndarray, inverse: Arr
             target = band[j + k, : reach + 1 - k]
             for m in range(len(source)):
                 target[m] -= multiplier * source[m]
-    return True
+    return replaced
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -113,25 +128,46 @@ def scatter(v: Array, order: np.ndarray, values: Array) -> None:
             values[order[p], c] = v[3 * p + c]
 
 
+class Factoring:
+    """A factorisation that can be done a little at a time."""
+
+    def __init__(self, blocks: Array, links: np.ndarray, order: np.ndarray, node_count: int) -> None:
+        """Of the stiffness that the link blocks (m, 3, 3) add up to on the nodes ``order`` (f,)."""
+        place = np.full(node_count, -1, dtype=np.int32)
+        place[order] = np.arange(len(order), dtype=np.int32)
+        ends = place[links]
+        ends = ends[np.all(ends >= 0, axis=1)]
+        reach = int(np.max(np.abs(ends[:, 1] - ends[:, 0]), initial=0))
+        size = 3 * len(order)
+        b = min(3 * reach + 2, size - 1)
+        self._band = np.zeros((size, b + 1))
+        assemble_band(blocks, links, place, self._band)
+        self._diagonal = self._band[:, 0].copy()
+        columns, rows = np.zeros((2, size, b), dtype=np.float32)
+        self.factor = BandedFactor(np.ascontiguousarray(order, dtype=np.int32), columns, rows, np.zeros(size))
+        self._next = 0
+        self.replaced = 0
+
+    def advance(self, count: int) -> bool:
+        """Eliminates ``count`` more unknowns; True when ``factor`` is complete."""
+        f = self.factor
+        last = min(self._next + count, len(f.inverse))
+        self.replaced += factor_band(self._band, self._diagonal, f.columns, f.rows, f.inverse, self._next, last)
+        self._next = last
+        return last == len(f.inverse)
+
+
 def factor(blocks: Array, links: np.ndarray, order: np.ndarray, node_count: int) -> BandedFactor:
-    """The factor of the stiffness that the link blocks (m, 3, 3) add up to on the nodes ``order`` (f,).
+    """The whole factor at once, see Factoring.
 
     Raises ValueError when the matrix is not positive definite, that is when the nodes can move without
     stretching a link.
     """
-    place = np.full(node_count, -1, dtype=np.int32)
-    place[order] = np.arange(len(order), dtype=np.int32)
-    ends = place[links]
-    ends = ends[np.all(ends >= 0, axis=1)]
-    reach = int(np.max(np.abs(ends[:, 1] - ends[:, 0]), initial=0))
-    b = min(3 * reach + 2, 3 * len(order) - 1)
-    band = np.zeros((3 * len(order), b + 1))
-    assemble_band(blocks, links, place, band)
-    columns, rows = np.zeros((2, 3 * len(order), b), dtype=np.float32)
-    inverse = np.zeros(3 * len(order))
-    if not factor_band(band, columns, rows, inverse):
+    work = Factoring(blocks, links, order, node_count)
+    work.advance(3 * len(order))
+    if work.replaced:
         raise ValueError("the links do not hold all free nodes in place: the stiffness matrix is singular")
-    return BandedFactor(np.ascontiguousarray(order, dtype=np.int32), columns, rows, inverse)
+    return work.factor
 
 
 def solve(kept: BandedFactor, values: Array, out: Array) -> None:

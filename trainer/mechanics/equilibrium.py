@@ -3,8 +3,8 @@
 Solves equation (2) of Brown et al. 2001 for all nodes at once, where the paper moves one node at a time. The
 stiffness of the rest state is factored once for each body (a band per vessel). Every solve minimises the energy by
 L-BFGS from the present state with that factor as base; what holds the tissue (anchors, cables) is few scalar rows and
-is included exactly. Nothing is factored again when a hold comes, goes or moves. A body that nothing holds and that
-has come to rest costs nothing.
+is included exactly. Nothing is factored again when a hold comes, goes or moves; a body that is bent so far that its
+rest stiffness misleads is factored anew where it is, a slice at each solve. A body that nothing holds costs nothing.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ import numpy as np
 from trainer.geometry import Array
 from trainer.mechanics import banded
 from trainer.mechanics.attachments import Anchors, Cable, Loads, Rows, flatten, pull
-from trainer.mechanics.links import LinkMesh, add_forces, blocks
+from trainer.mechanics.compliance import Compliance
+from trainer.mechanics.links import LinkMesh, add_forces
 from trainer.mechanics.quasi_newton import add_scaled, after_base, at_points, before_base, dot, hold_base, spread
 
 #: Secant pairs kept from one solve to the next.
@@ -31,6 +32,8 @@ CABLE_MM = 1e-5
 CABLE_PENALTY = 1e3
 #: Sufficient decrease (Armijo), and the shortest step tried.
 DECREASE, SHORTEST_STEP = 1e-4, 1e-4
+#: More iterations than this in a solve: the kept factor no longer serves, begin a new one.
+SLOW = 4
 #: Share of an energy that is lost to rounding when it is summed over thousands of links.
 ROUNDING = 1e-14
 #: On the way to a target that has leapt, the residual may be so many times the tolerance.
@@ -87,21 +90,9 @@ class Equilibrium:
         n = len(mesh.rest)
         self.mesh = mesh
         self.x = mesh.rest.copy()
-        link_blocks = blocks(mesh, mesh.rest)
-        self._factors = tuple(banded.factor(link_blocks, mesh.links, order, n) for order in orders)
-        self._nodes = tuple((int(o.min()), int(o.max()) + 1) for o in orders)
-        body = np.searchsorted([lo for lo, _ in self._nodes], mesh.links.min(axis=1), side="right") - 1
-        self._links = tuple((int(r[0]), int(r[-1]) + 1) for r in (np.flatnonzero(body == b) for b in range(len(orders))))
+        self.compliance = Compliance(mesh, orders)
         self._step_limit = float(np.median(mesh.rest_length))
         self._at_rest = [True] * len(orders)
-
-        self._free_slots: list[int] = []
-        self._slot_nodes = np.zeros((0, 3), dtype=np.int64)
-        self._slot_weights = np.zeros((0, 3))
-        self._slot_range = np.zeros((0, 2), dtype=np.int64)
-        self._influence = np.zeros((0, 3, n, 3))
-        self._compliance = np.zeros((0, 0))
-
         self._s, self._y = np.zeros((PAIRS, n, 3)), np.zeros((PAIRS, n, 3))
         self._newest, self._count = 0, 0
         self._force, self._old_force, self._g, self._q, self._z = np.zeros((5, n, 3))
@@ -111,37 +102,17 @@ class Equilibrium:
 
     def hold(self, nodes: np.ndarray, weights: Array) -> int:
         """A slot for the material point that is the mean of ``nodes`` (3,) with ``weights`` (3,), all of one body."""
-        if not self._free_slots:
-            self._more_slots()
-        slot = self._free_slots.pop(0)
-        body = self._body(int(nodes[0]))
-        lo, hi = self._nodes[body]
-        self._slot_nodes[slot] = nodes
-        self._slot_weights[slot] = weights
-        self._slot_range[slot] = lo, hi
-        push = np.zeros_like(self.x)
-        for r in range(3):
-            push[nodes] = 0.0
-            np.add.at(push[:, r], nodes, weights)
-            banded.solve(self._factors[body], push, self._influence[slot, r])
-            mean = np.zeros((len(self._slot_nodes), 3))
-            at_points(self._influence[slot, r], self._slot_nodes, self._slot_weights, mean)
-            self._compliance[:, 3 * slot + r] = mean.ravel()
-            self._compliance[3 * slot + r, :] = mean.ravel()
-        return slot
+        return self.compliance.hold(nodes, weights)
 
     def drop(self, slot: int) -> None:
         """Forgets a material point; its number may be given out again."""
-        self._slot_weights[slot] = 0.0
-        self._influence[slot] = 0.0
+        self.compliance.drop(slot)
         self._last_target.pop(slot, None)
         self._tension = {k: v for k, v in self._tension.items() if slot not in k}
-        self._free_slots.append(slot)
-        self._free_slots.sort()
 
     def position(self, slot: int) -> Array:
         """Where a material point is, (3,) mm."""
-        return np.asarray(self._slot_weights[slot] @ self.x[self._slot_nodes[slot]])
+        return np.asarray(self.compliance.slot_weights[slot] @ self.x[self.compliance.slot_nodes[slot]])
 
     def solve(
         self,
@@ -177,10 +148,9 @@ class Equilibrium:
             tolerance = tolerance_mN if step == steps else STEP_TOLERANCE * tolerance_mN
             converged, used = self._minimise(rows, work, tolerance, max_iterations)
             iterations += used
-        self._at_rest = [
-            at_rest or (converged and not bool(np.any(self._slot_range[rows.slots, 0] == lo)))
-            for at_rest, (lo, _) in zip(self._at_rest, self._nodes, strict=True)
-        ]
+        if iterations > steps * SLOW:
+            self.compliance.refresh(work.awake, self.x)
+        self.compliance.advance()
         self._last_target = {int(s): t.copy() for s, t in zip(anchors.slot, rows.target, strict=True)}
         self._tension = {_key(c): float(t) for c, t in zip(cables, work.multiplier, strict=True)}
         cable_share = np.where(excess > 0.0, shortened / np.maximum(excess, 1e-300), 1.0)
@@ -196,18 +166,22 @@ class Equilibrium:
         )
 
     def _work(self, rows: Rows, cables: tuple[Cable, ...]) -> _Work:
-        """The arrays of one solve; bodies that something holds are woken."""
+        """The arrays of one solve. A body that nothing holds is put to rest, the only state without force it has."""
+        held = self.compliance
         u, c = len(rows.slots), len(rows.length)
-        nodes, weights = self._slot_nodes[rows.slots], self._slot_weights[rows.slots]
-        if np.any(weights.sum(axis=1) == 0.0):
+        nodes, weights = held.slot_nodes[rows.slots], held.slot_weights[rows.slots]
+        if not np.all(np.any(weights != 0.0, axis=1)):
             raise ValueError("a slot is used that was dropped")
-        for b, (lo, _) in enumerate(self._nodes):
-            self._at_rest[b] = self._at_rest[b] and not bool(np.any(self._slot_range[rows.slots, 0] == lo))
-        awake = [b for b, at_rest in enumerate(self._at_rest) if not at_rest]
+        bodies = set(held.body_of(nodes[:, 0]).tolist())
+        for b, (lo, hi) in enumerate(held.nodes):
+            if b not in bodies and not self._at_rest[b]:
+                self.x[lo:hi] = self.mesh.rest[lo:hi]
+            self._at_rest[b] = b not in bodies
+        awake = sorted(bodies)
         work = _Work(
             awake=awake,
-            first=self._nodes[awake[0]][0] if awake else 0,
-            last=self._nodes[awake[-1]][1] if awake else 0,
+            first=held.nodes[awake[0]][0] if awake else 0,
+            last=held.nodes[awake[-1]][1] if awake else 0,
             nodes=nodes,
             weights=weights,
             multiplier=np.array([self._tension.get(_key(cable), 0.0) for cable in cables]),
@@ -226,7 +200,7 @@ class Equilibrium:
         if c:
             self._evaluate(rows, work, self.x)  # for the rows' directions
             dof = (3 * rows.slots[:, None] + np.arange(3)).ravel()
-            compliance = self._compliance[np.ix_(dof, dof)]
+            compliance = held.matrix[np.ix_(dof, dof)]
             for n in range(c):
                 d = np.zeros((u, 3))
                 for k in range(rows.cable_start[n], rows.cable_start[n + 1]):
@@ -242,7 +216,7 @@ class Equilibrium:
         self._force[work.first : work.last] = 0.0
         m = self.mesh
         for b in work.awake:
-            energy += add_forces(x, m.links, m.rest_length, m.stiffness, *self._links[b], self._force)
+            energy += add_forces(x, m.links, m.rest_length, m.stiffness, *self.compliance.links[b], self._force)
         at_points(x, work.nodes, work.weights, work.point)
         return energy + pull(
             work.point,
@@ -283,15 +257,15 @@ class Equilibrium:
             q, *history, work.matrix, work.nodes, work.weights, lo, hi, work.moved, work.pulled, curvature, share
         )
         for b in work.awake:
-            banded.solve(self._factors[b], q, z)
+            banded.solve(self.compliance.factors[b], q, z)
         hold_base(
             z,
             rows.slots,
             work.nodes,
             work.weights,
-            self._influence,
-            self._slot_range,
-            self._compliance,
+            self.compliance.columns,
+            self.compliance.slot_range,
+            self.compliance.matrix,
             work.matrix,
             work.answer,
             work.held,
@@ -322,11 +296,13 @@ class Equilibrium:
             longest = float(np.max(np.abs(d[lo:hi])))
             t = 1.0 if longest <= self._step_limit else self._step_limit / longest
             self._old_force[lo:hi] = self._force[lo:hi]
+            # What rounding of the energy's sum, and of coordinates far from the origin, can pretend.
+            noise = ROUNDING * (abs(energy) + float(np.max(np.abs(self.x[lo:hi]))) * float(np.sum(np.abs(work.force))))
             while True:
                 self._trial[lo:hi] = self.x[lo:hi]
                 add_scaled(-t, d, self._trial, lo, hi)
                 new_energy = self._evaluate(rows, work, self._trial)
-                if new_energy <= energy - DECREASE * t * slope + ROUNDING * (abs(energy) + abs(new_energy)):
+                if new_energy <= energy - DECREASE * t * slope + noise:
                     break
                 t *= 0.5
                 if t < SHORTEST_STEP:
@@ -342,19 +318,6 @@ class Equilibrium:
             g = self._gradient(work)
         return work.residual <= tolerance_mN and bool(np.all(work.stretch <= CABLE_MM)), max_iterations
 
-    def _body(self, node: int) -> int:
-        return int(np.searchsorted([lo for lo, _ in self._nodes], node, side="right")) - 1
-
-    def _more_slots(self) -> None:
-        old = len(self._slot_nodes)
-        new = max(8, 2 * old)
-        self._free_slots = list(range(old, new))
-        self._slot_nodes = _grown(self._slot_nodes, (new, 3))
-        self._slot_weights = _grown(self._slot_weights, (new, 3))
-        self._slot_range = _grown(self._slot_range, (new, 2))
-        self._influence = _grown(self._influence, (new, *self._influence.shape[1:]))
-        self._compliance = _grown(self._compliance, (3 * new, 3 * new))
-
 
 def _distance(stiffness: Array, way: Array) -> Array:
     """How far (a,) mm targets move in the directions in which the anchors hold."""
@@ -365,9 +328,3 @@ def _distance(stiffness: Array, way: Array) -> Array:
 
 def _key(cable: Cable) -> tuple[int, ...]:
     return tuple(int(s) for s in cable.slot)
-
-
-def _grown(a: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    out = np.zeros(shape, dtype=a.dtype)
-    out[tuple(slice(0, k) for k in a.shape)] = a
-    return out

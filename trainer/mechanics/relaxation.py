@@ -114,7 +114,7 @@ def relax(
     cut_off_mN: float = 0.0,
     out_of_time: Callable[[], bool] = lambda: False,
 ) -> Relaxation:
-    """Moves the variable nodes of ``x`` (n, 3), in place, towards equilibrium with the nodes ``moved`` (k,) where they are.
+    """Moves the variable nodes of ``x`` (n, 3), in place, towards equilibrium; the nodes ``moved`` (k,) stay.
 
     ``load`` (n, 3) mN is the external force on each node: gravity m_i g, a push. ``most_links`` and ``cut_off_mN``
     limit the region as in the paper. Ends when the residual is small enough, after ``most_sweeps``, or when

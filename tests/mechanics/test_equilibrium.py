@@ -1,0 +1,310 @@
+"""Verification of the equilibrium solver against laws, and against the paper's relaxation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from trainer.anatomy.vessel import Tissue, Vessel, build, place, wall_point
+from trainer.config import Sourced
+from trainer.curriculum import VesselSpec
+from trainer.geometry import Array, Rigid, quaternion_from_axis_angle
+from trainer.mechanics import banded
+from trainer.mechanics.attachments import Anchors, Cable, Loads
+from trainer.mechanics.equilibrium import CABLE_MM, MOST_STEPS, STEP_MM, Equilibrium
+from trainer.mechanics.links import blocks, forces, hessian
+from trainer.mechanics.relaxation import breadth_first, relax
+
+MODULUS_kPa = 1000.0
+ASSUMED = Sourced(MODULUS_kPa, "assumed")
+MOVED = Rigid(np.array([1000.0, -300.0, 20.0]), quaternion_from_axis_angle([1.0, 2.0, -0.5], 1.1))
+CORNER = np.array([1.0, 0.0, 0.0])
+
+
+def vessel(name: str, cut_mm: float, axis: float, layers: int = 9, around: int = 12) -> Vessel:
+    spec = VesselSpec(
+        name, (cut_mm, 0.0, 0.0), (axis, 0.0, 0.0), 1.0, 0.15, 2.0, layers, around, ASSUMED, ASSUMED, ASSUMED, ASSUMED
+    )
+    return build(spec)
+
+
+@pytest.fixture(scope="module")
+def tissue() -> Tissue:
+    return place((vessel("A", -0.2, -1.0), vessel("B", 0.2, 1.0)), Rigid.identity())
+
+
+def state_of(tissue: Tissue) -> Equilibrium:
+    return Equilibrium(tissue.mesh, tissue.orders())
+
+
+def hold(state: Equilibrium, tissue: Tissue, k: int, clock: float, axial: float) -> int:
+    nodes, weights = wall_point(tissue.vessels[k], clock, axial, "outer")
+    return state.hold(nodes + tissue.offset[k], weights)
+
+
+def spring(state: Equilibrium, slot: int, move: Array, k: float = 1e4) -> Anchors:
+    return Anchors(np.array([slot]), (state.position(slot) + move)[None], k * np.eye(3)[None])
+
+
+def test_banded_solve_is_the_dense_one(tissue: Tissue) -> None:
+    """K z = g to the single precision of the kept factor: 6e-8 times the condition number of about 1e4, 1e-3."""
+    mesh, order = tissue.mesh, tissue.orders()[1]
+    kept = banded.factor(blocks(mesh, mesh.rest), mesh.links, order, len(mesh.rest))
+    load, answer = np.random.default_rng(0).normal(size=mesh.rest.shape), np.zeros_like(mesh.rest)
+    banded.solve(kept, load, answer)
+    free = (3 * order[:, None] + np.arange(3)).ravel()
+    dense = np.linalg.solve(hessian(mesh, mesh.rest)[np.ix_(free, free)], load.ravel()[free])
+    assert np.abs(answer.ravel()[free] - dense).max() < 1e-3 * np.abs(dense).max()
+    assert np.all(answer[tissue.nodes(0)] == 0.0)
+
+
+def test_a_body_that_can_move_freely_is_refused(tissue: Tissue) -> None:
+    mesh = tissue.mesh
+    with pytest.raises(ValueError, match="do not hold all free nodes"):
+        banded.factor(blocks(mesh, mesh.rest), mesh.links, np.arange(tissue.offset[1], dtype=np.int32), len(mesh.rest))
+
+
+def test_nothing_held_nothing_moves(tissue: Tissue) -> None:
+    state = state_of(tissue)
+    answer = state.solve()
+    assert answer.converged
+    assert answer.iterations == 0
+    assert np.array_equal(state.x, tissue.mesh.rest)
+
+
+def test_axial_stretch_of_the_tube_against_its_modulus() -> None:
+    """k = E A / L of a bar, E the modulus that the links were given, within 10 per cent (0.947 measured).
+
+    The stiffness rule is exact for directions spread evenly over the sphere. The five-way split of a cell is not: in
+    bulk it gives 1.2 E along the sides of cubes (test_links), and a wall one cell thick, all surface, relaxes part
+    of that. With other proportions of the cells the same rule gives 0.86 to 1.47; this test is of those in use.
+    """
+    end = vessel("A", 0.0, 1.0, layers=21, around=24)
+    tissue = place((end,), Rigid.identity())
+    state = state_of(tissue)
+    cut = np.flatnonzero(end.axial_mm == 0.0)
+    slots = np.array([state.hold(np.full(3, i), CORNER) for i in cut])
+    along = np.array([state.position(s) for s in slots]) - 0.002 * end.axis
+    stiffness = np.broadcast_to(1e6 * np.outer(end.axis, end.axis), (len(slots), 3, 3))
+    answer = state.solve(Anchors(slots, along, stiffness), tolerance_mN=1e-5)
+    assert answer.converged
+    bar = MODULUS_kPa * np.pi * (0.5**2 - 0.35**2) / 2.0
+    measured = -float((answer.anchor_force @ end.axis).sum()) / 0.002
+    assert 0.9 < measured / bar < 1.1
+
+
+@pytest.mark.parametrize("move", [(0.0, 0.0, -0.15), (0.0, 0.0, 0.3), (0.0, 0.2, 0.0), (0.3, 0.0, 0.0)])
+def test_agrees_with_the_paper_s_relaxation(tissue: Tissue, move: tuple[float, float, float]) -> None:
+    """Two ways to one equilibrium: a residual of 1e-8 mN at the softest stiffness, about 1 mN/mm, is 1e-8 mm."""
+    mesh, node = tissue.mesh, tissue.vessels[0].node(2, 0)
+    state = state_of(tissue)
+    answer = state.solve(spring(state, state.hold(np.full(3, node), CORNER), np.array(move)), tolerance_mN=1e-8)
+    assert answer.converged
+    x = mesh.rest.copy()
+    x[node] = state.x[node]
+    assert relax(mesh, x, np.array([node]), tolerance_mN=1e-8, most_sweeps=100_000).converged
+    assert np.abs(state.x - mesh.rest).max() > 0.1
+    assert np.abs(x - state.x).max() < 1e-6
+
+
+def test_relaxation_region_and_cut_off(tissue: Tissue) -> None:
+    """Nodes beyond the region stay; with a cut-off nothing moves where forces below it arrive."""
+    mesh, node = tissue.mesh, tissue.vessels[0].node(2, 0)
+    order = breadth_first(mesh, np.array([node]), most_links=2)
+    one = set(mesh.neighbour[mesh.start[node] : mesh.start[node + 1]])
+    two = {int(j) for i in one for j in mesh.neighbour[mesh.start[i] : mesh.start[i + 1]]}
+    assert set(order) == (one | two) - {node}
+    assert set(order[: len(one)]) == one
+    x = mesh.rest.copy()
+    x[node, 2] += 0.05
+    relax(mesh, x, np.array([node]), tolerance_mN=1e-9, most_sweeps=50, most_links=2)
+    assert {int(i) for i in np.flatnonzero(np.any(x != mesh.rest, axis=1))} <= one | two | {node}
+    x = mesh.rest.copy()
+    x[node, 2] += 0.05
+    relax(mesh, x, np.array([node]), tolerance_mN=1e-9, most_sweeps=50, cut_off_mN=1e3)
+    assert np.flatnonzero(np.any(x != mesh.rest, axis=1)).tolist() == [node]
+
+
+def test_relaxation_stops_when_its_caller_has_no_time(tissue: Tissue) -> None:
+    x = tissue.mesh.rest.copy()
+    x[0, 2] += 0.1
+    answer = relax(
+        tissue.mesh, x, np.array([0]), tolerance_mN=0.0, most_sweeps=1000, out_of_time=iter([False, True]).__next__
+    )
+    assert not answer.converged
+    assert answer.sweeps == 10
+
+
+def test_an_anchor_s_force_is_what_the_tissue_and_its_clamps_give_back(tissue: Tissue) -> None:
+    """Balance of the whole vessel: anchor + forces of the links on the fixed nodes' supports = 0 within the residual.
+
+    The residual vector of Euclidean norm 1e-7 over 200 nodes adds up to at most 1e-7 √200.
+    """
+    state = state_of(tissue)
+    slot = hold(state, tissue, 0, 0.4, 0.35)
+    answer = state.solve(spring(state, slot, np.array([0.1, 0.05, -0.1])), tolerance_mN=1e-7)
+    support = -forces(tissue.mesh, state.x)[tissue.mesh.fixed].sum(axis=0)
+    assert np.linalg.norm(answer.anchor_force) > 0.5
+    assert np.abs(answer.anchor_force[0] + support).max() < 2e-6
+
+
+def test_load_and_anchor_are_two_sides_of_one_equilibrium(tissue: Tissue) -> None:
+    """The force that an anchor gave, given as a load, leads to the same place."""
+    state = state_of(tissue)
+    slot = hold(state, tissue, 1, 0.0, 0.35)
+    answer = state.solve(spring(state, slot, np.array([0.0, 0.0, -0.1])), tolerance_mN=1e-8)
+    held = state.x.copy()
+    answer = state.solve(loads=Loads(np.array([slot]), answer.anchor_force), tolerance_mN=1e-8)
+    assert answer.converged
+    assert np.abs(state.x - held).max() < 1e-6
+
+
+def test_a_hole_slides_along_a_needle(tissue: Tissue) -> None:
+    """An anchor k (I - t tᵀ) gives no force along t."""
+    state = state_of(tissue)
+    slot, t = hold(state, tissue, 0, 0.0, 0.35), np.array([0.6, 0.0, 0.8])
+    target = state.position(slot) + np.array([0.1, 0.05, 0.0])
+    answer = state.solve(Anchors(np.array([slot]), target[None], 1e4 * (np.eye(3) - np.outer(t, t))[None]))
+    assert answer.converged
+    assert np.linalg.norm(answer.anchor_force) > 0.1
+    assert abs(answer.anchor_force[0] @ t) < 1e-9
+
+
+def test_a_cable_between_the_ends_keeps_its_length_and_pulls_both_alike(tissue: Tissue) -> None:
+    """Path no longer than the thread within CABLE_MM; equal and opposite pulls; the mirror image moves alike.
+
+    Tension is checked on the clamps of each vessel: residual 1e-6 over √200 nodes.
+    """
+    state = state_of(tissue)
+    a, b = hold(state, tissue, 0, 0.0, 0.35), hold(state, tissue, 1, 0.0, 0.35)
+    gap = float(np.linalg.norm(state.position(a) - state.position(b)))
+    cable = Cable(np.array([a, b]), np.zeros((2, 3)), gap - 0.3)
+    answer = state.solve(cables=(cable,), tolerance_mN=1e-6)
+    assert answer.converged
+    line = state.position(b) - state.position(a)
+    assert abs(np.linalg.norm(line) - cable.length_mm) <= CABLE_MM
+    pulled = answer.tension[0] * line / np.linalg.norm(line)
+    support = -forces(tissue.mesh, state.x)
+    for k, pull in ((0, pulled), (1, -pulled)):
+        fixed = np.flatnonzero(tissue.mesh.fixed[tissue.nodes(k)]) + tissue.offset[k]
+        assert np.abs(support[fixed].sum(axis=0) + pull).max() < 2e-5
+    moved = state.x - tissue.mesh.rest
+    assert answer.tension[0] > 1.0
+    assert np.abs(moved[tissue.nodes(0)] * (-1, 1, 1) - moved[tissue.nodes(1)]).max() < 1e-4
+
+
+def test_a_slack_cable_does_nothing_and_a_taut_one_turns_round_a_hole(tissue: Tissue) -> None:
+    """Interior point: tension times the sum of the two unit vectors away from it."""
+    state = state_of(tissue)
+    a = hold(state, tissue, 0, 0.0, 0.35)
+    ends = state.position(a) + np.array([[1.0, 0.0, 0.6], [0.0, 0.0, 0.0], [0.2, 0.8, 0.6]])
+    path = float(np.linalg.norm(ends[0] - ends[1]) + np.linalg.norm(ends[2] - ends[1]))
+    slots = np.array([-1, a, -1])
+    answer = state.solve(cables=(Cable(slots, ends, path + 0.01),))
+    assert answer.tension.tolist() == [0.0]
+    assert np.array_equal(state.x, tissue.mesh.rest)
+    answer = state.solve(cables=(Cable(slots, ends, path - 0.1),), tolerance_mN=1e-6)
+    assert answer.converged
+    assert answer.cable_error_mm <= CABLE_MM
+    p = state.position(a)
+    away = [(e - p) / np.linalg.norm(e - p) for e in (ends[0], ends[2])]
+    support = -forces(tissue.mesh, state.x)[tissue.mesh.fixed].sum(axis=0)
+    assert np.abs(support + answer.tension[0] * (away[0] + away[1])).max() < 2e-5
+
+
+@pytest.mark.parametrize("what", ["anchor", "cable"])
+def test_the_answer_does_not_depend_on_where_the_scene_stands(tissue: Tissue, what: str) -> None:
+    """Moved by 1 m and turned: the same forces to 1e-6, given a residual of 1e-7 mN in forces above 0.1 mN."""
+    moved = place(tissue.vessels, MOVED)
+    answers = []
+    for t, rotate in ((tissue, lambda v: v), (moved, MOVED.rotate)):
+        state = state_of(t)
+        a, b = hold(state, t, 0, 0.3, 0.35), hold(state, t, 1, 0.1, 0.4)
+        if what == "anchor":
+            answer = state.solve(spring(state, a, rotate(np.array([0.05, 0.02, -0.08]))), tolerance_mN=1e-7)
+            force = answer.anchor_force[0]
+            answers.append(MOVED.inverse().rotate(force) if t is moved else force)
+        else:
+            cable = Cable(np.array([a, b]), np.zeros((2, 3)), 1.0)
+            answers.append(state.solve(cables=(cable,), tolerance_mN=1e-7).tension)
+        assert np.abs(answers[-1]).max() > 0.1
+    assert np.abs(answers[0] - answers[1]).max() < 1e-6 * np.abs(answers[0]).max()
+
+
+def test_a_leap_of_20_mm_stays_finite_and_is_followed_in_steps(tissue: Tissue) -> None:
+    """A held point moves at most MOST_STEPS · STEP_MM in one solve, which is said; let go, the vessel is at rest."""
+    state = state_of(tissue)
+    slot = hold(state, tissue, 0, 0.0, 0.35)
+    start = state.position(slot)
+    away = spring(state, slot, np.array([0.0, 0.0, -20.0]))
+    answer = state.solve(away, max_iterations=20)
+    assert not answer.converged
+    assert answer.reached == pytest.approx(MOST_STEPS * STEP_MM / 20.0)
+    assert np.linalg.norm(state.position(slot) - start) < MOST_STEPS * STEP_MM + 0.01
+    for _ in range(3):
+        state.solve(away, max_iterations=20)
+        assert np.all(np.isfinite(state.x))
+    back = Anchors(np.array([slot]), start[None], 1e4 * np.eye(3)[None])
+    assert [state.solve(back, tolerance_mN=1e-4).converged for _ in range(10)][-1]
+    state.drop(slot)
+    assert state.solve().converged
+    assert np.array_equal(state.x, tissue.mesh.rest)
+
+
+@pytest.mark.parametrize("bend_mm", [-0.6, 0.5])
+def test_a_factor_made_anew_changes_the_way_and_not_the_answer(tissue: Tissue, bend_mm: float) -> None:
+    """A bent end, moved about until its stiffness was factored where it is: fewer iterations to the same place.
+
+    Both states have a residual below 1e-7 mN, at a stiffness of about 1 mN/mm: 1e-6 mm is ample. A point held
+    since the beginning and one held meanwhile take part.
+    """
+    state, kept = state_of(tissue), state_of(tissue)
+    kept.compliance.refresh = lambda bodies, x: None  # type: ignore[method-assign]
+    iterations = []
+    for s in (state, kept):
+        slot = hold(s, tissue, 0, 0.0, 0.0)
+        start = s.position(slot)
+        used = []
+        for i in range(80):
+            if i == 30:
+                more = hold(s, tissue, 0, 2.0, 0.3)
+            move = np.array([0.02 * np.sin(0.4 * i), 0.02 * np.cos(0.3 * i), bend_mm * min(1.0, (i + 1) / 12)])
+            load = Loads(np.array([more]), np.array([[0.0, 0.1, 0.0]])) if i >= 30 else None
+            anchor = Anchors(np.array([slot]), (start + move)[None], 1e4 * np.eye(3)[None])
+            answer = s.solve(anchor, loads=load, tolerance_mN=1e-7, max_iterations=300)
+            assert answer.converged
+            used.append(answer.iterations)
+        iterations.append(np.median(used[-20:]))
+    assert iterations[0] < 0.6 * iterations[1]
+    assert np.abs(state.x - kept.x).max() < 1e-6
+
+
+@pytest.mark.parametrize(
+    "held",
+    [
+        lambda a: {"anchors": Anchors(np.array([a]), np.full((1, 3), np.nan), np.eye(3)[None])},
+        lambda a: {"loads": Loads(np.array([a]), np.full((1, 3), np.inf))},
+        lambda a: {"cables": (Cable(np.array([a, -1]), np.full((2, 3), np.nan), 1.0),)},
+    ],
+)
+def test_what_is_not_finite_is_refused(tissue: Tissue, held: Callable[[int], dict[str, object]]) -> None:
+    state = state_of(tissue)
+    slot = hold(state, tissue, 0, 0.0, 0.35)
+    with pytest.raises(ValueError, match="not finite"):
+        state.solve(**held(slot))  # type: ignore[arg-type]
+    assert np.array_equal(state.x, tissue.mesh.rest)
+
+
+def test_two_runs_give_the_same_bits(tissue: Tissue) -> None:
+    def run() -> Array:
+        state = state_of(tissue)
+        a, b = hold(state, tissue, 0, 0.0, 0.35), hold(state, tissue, 1, 0.0, 0.35)
+        for i in range(30):
+            move = np.array([0.0, 0.1 * np.sin(0.3 * i), -0.02 * i])
+            anchor = Anchors(np.array([a]), (tissue.mesh.rest[0] + move)[None], 1e3 * np.eye(3)[None])
+            state.solve(anchor, (Cable(np.array([a, b]), np.zeros((2, 3)), 0.9),))
+        return state.x
+
+    assert np.array_equal(run(), run())

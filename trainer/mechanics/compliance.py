@@ -1,0 +1,133 @@
+"""How held material points answer to forces: kept factors of the bodies, and each point's influence columns.
+
+A body's stiffness is factored at rest, and may be factored again at a deformed state when the old factor no longer
+serves: a slice of the elimination at each tick, then one point's columns at each tick, so that no tick pays for it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from trainer.geometry import Array
+from trainer.mechanics import banded
+from trainer.mechanics.links import LinkMesh, link_blocks
+from trainer.mechanics.quasi_newton import at_points
+
+#: Slices into which a new factorisation is divided.
+SLICES = 24
+
+
+class Compliance:
+    """Factors of bodies, which follow one another in the numbering of nodes and links, and the slots of held points."""
+
+    def __init__(self, mesh: LinkMesh, orders: tuple[np.ndarray, ...]) -> None:
+        """``orders``: each body's free nodes in elimination order. Raises ValueError when a free node can move without
+        stretching a link."""
+        n = len(mesh.rest)
+        self._mesh = mesh
+        self._orders = orders
+        self._blocks = np.zeros((len(mesh.links), 3, 3))
+        link_blocks(mesh.rest, mesh.links, mesh.rest_length, mesh.stiffness, False, self._blocks)
+        self.factors = [banded.factor(self._blocks, mesh.links, order, n) for order in orders]
+        self._first = np.array([int(o.min()) for o in orders])
+        self.nodes = [(int(o.min()), int(o.max()) + 1) for o in orders]  # rows of each body's free nodes
+        body = self.body_of(mesh.links.min(axis=1))
+        at = [np.flatnonzero(body == b) for b in range(len(orders))]
+        self.links = [(int(r[0]), int(r[-1]) + 1) for r in at]
+        self._free: list[int] = []
+        self.slot_nodes = np.zeros((0, 3), dtype=np.int64)
+        self.slot_weights = np.zeros((0, 3))  # zero for a slot that is free
+        self.slot_range = np.zeros((0, 2), dtype=np.int64)  # rows of the nodes of the slot's body
+        self.columns = np.zeros((0, 3, n, 3))  # K⁻¹ Wᵀ, mm per mN
+        self.matrix = np.zeros((0, 0))  # W K⁻¹ Wᵀ over all slots
+        self._age = [0] * len(orders)  # how many factors ago each body's was made
+        self._under_way: tuple[int, banded.Factoring] | None = None
+        self._ready: dict[int, Array] = {}
+
+    def body_of(self, node: np.ndarray | int) -> np.ndarray:
+        """The body to which a node (or each of some nodes) belongs."""
+        return np.asarray(np.searchsorted(self._first, node, side="right") - 1)
+
+    def hold(self, nodes: np.ndarray, weights: Array) -> int:
+        """A slot for the mean of ``nodes`` (3,), all of one body, with ``weights`` (3,)."""
+        if not self._free:
+            self._more_slots()
+        slot = self._free.pop(0)
+        body = int(self.body_of(int(nodes[0])))
+        self.slot_nodes[slot] = nodes
+        self.slot_weights[slot] = weights
+        self.slot_range[slot] = self.nodes[body]
+        self.columns[slot] = self._answers(slot, self.factors[body])
+        self._couple(slot)
+        return slot
+
+    def drop(self, slot: int) -> None:
+        """Gives the slot back; its number may be given out again."""
+        self.slot_weights[slot] = 0.0
+        self._ready.pop(slot, None)
+        self._free.append(slot)
+        self._free.sort()
+
+    def refresh(self, bodies: list[int], x: Array) -> None:
+        """Begins to factor one of ``bodies`` at ``x`` (n, 3), that of the oldest factor; unless one is under way."""
+        if self._under_way is not None or not bodies:
+            return
+        body = max(bodies, key=lambda b: (self._age[b], -b))
+        m = self._mesh
+        link_blocks(x, m.links, m.rest_length, m.stiffness, False, self._blocks)
+        order = self._orders[body]
+        self._under_way = body, banded.Factoring(self._blocks, m.links, order, len(m.rest))
+
+    def advance(self) -> None:
+        """One slice of the work that :meth:`refresh` began; the last one changes the factor and the columns."""
+        if self._under_way is None:
+            return
+        body, work = self._under_way
+        if not work.advance(-(-len(work.factor.inverse) // SLICES)):
+            return
+        held = np.flatnonzero((self.slot_range[:, 0] == self.nodes[body][0]) & np.any(self.slot_weights != 0.0, axis=1))
+        waiting = [int(s) for s in held if int(s) not in self._ready]
+        if waiting:
+            self._ready[waiting[0]] = self._answers(waiting[0], work.factor)
+            return
+        self.factors[body] = work.factor
+        for slot in held:
+            self.columns[slot] = self._ready[int(slot)]
+        for slot in held:
+            self._couple(int(slot))
+        self._age = [0 if b == body else age + 1 for b, age in enumerate(self._age)]
+        self._under_way = None
+        self._ready = {}
+
+    def _answers(self, slot: int, factor: banded.BandedFactor) -> Array:
+        """The displacements (3, n, 3) of all nodes by a unit force on the slot along x, y and z."""
+        out = np.zeros((3, *self._mesh.rest.shape))
+        push = np.zeros_like(self._mesh.rest)
+        for r in range(3):
+            push[self.slot_nodes[slot]] = 0.0
+            np.add.at(push[:, r], self.slot_nodes[slot], self.slot_weights[slot])
+            banded.solve(factor, push, out[r])
+        return out
+
+    def _couple(self, slot: int) -> None:
+        mean = np.zeros((len(self.slot_nodes), 3))
+        for r in range(3):
+            at_points(self.columns[slot, r], self.slot_nodes, self.slot_weights, mean)
+            self.matrix[:, 3 * slot + r] = mean.ravel()
+            self.matrix[3 * slot + r, :] = mean.ravel()
+
+    def _more_slots(self) -> None:
+        old = len(self.slot_nodes)
+        new = max(8, 2 * old)
+        self._free = list(range(old, new))
+        self.slot_nodes = _grown(self.slot_nodes, (new, 3))
+        self.slot_weights = _grown(self.slot_weights, (new, 3))
+        self.slot_range = _grown(self.slot_range, (new, 2))
+        self.columns = _grown(self.columns, (new, *self.columns.shape[1:]))
+        self.matrix = _grown(self.matrix, (3 * new, 3 * new))
+
+
+def _grown(a: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    out = np.zeros(shape, dtype=a.dtype)
+    out[tuple(slice(0, k) for k in a.shape)] = a
+    return out
