@@ -77,10 +77,10 @@ def strip(row: MetricRow, earlier: tuple[float, ...] = ()) -> str:
 def stitch_map(shown: StitchMap) -> str:
     """Looking at each cut edge, unrolled outwards: angle is the clock, distance from the inner circle the bite."""
     size, edge, rim = 206.0, 32.0, 82.0
-    width, height = size * max(len(shown.vessels), 1), 246.0
+    width, height = max(size * len(shown.vessels), 300.0), 246.0  # the legend is 300 wide
     farthest = max([0.5, *(b.bite_mm for b in shown.bites), *(m.bite_mm for m in shown.marks)])
     rings = ticks(0.0, farthest, 3)
-    centres = {v: (size * (i + 0.5), 106.0) for i, v in enumerate(shown.vessels)}
+    centres = {v: (0.5 * width + size * (i + 0.5 - 0.5 * len(shown.vessels)), 106.0) for i, v in enumerate(shown.vessels)}
 
     def place(vessel: str, clock_deg: float, bite_mm: float) -> tuple[float, float]:
         radius = edge + (rim - edge) * max(bite_mm, 0.0) / rings[-1]

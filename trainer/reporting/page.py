@@ -20,7 +20,7 @@ from trainer.reporting.summary import curve_words, session_summary, task_summary
 
 MAP_CAPTION = (
     "Each vessel end around its cut edge, 3 o'clock on the same side of both. Distance from the inner circle is the "
-    "bite in mm; the number is the pass; dashed dots were left again."
+    "bite in mm; the number is the pass; a dot with a dashed edge was left again."
 )
 
 
