@@ -32,7 +32,7 @@ def blueprint() -> rrb.Blueprint:
     scores = rrb.TextDocumentView(origin="/scores", name="Scores")
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Vertical(stitch, states, row_shares=[4, 1]),
+            rrb.Vertical(stitch, states, row_shares=[3, 1]),
             rrb.Vertical(forces, rrb.Tabs(scores, closures), log, row_shares=[2, 2, 3]),
             column_shares=[3, 2],
         ),
