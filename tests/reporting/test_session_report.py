@@ -15,6 +15,7 @@ from rich.console import Console
 
 from tests.metrics.synthetic_session import DRIVE, at, performed, pierce, record, stitch, task_of
 from tests.metrics.synthetic_session import withdraw as withdrawn
+from trainer.curriculum import load_task, parse_task
 from trainer.events import KINDS, Aborted, Contact, Overforce, TickOverrun, TrackingBack, TrackingLost
 from trainer.reporting import figures, terminal, wording
 from trainer.reporting.page import session_page
@@ -129,11 +130,14 @@ def test_the_page_stands_alone() -> None:
 
 def test_names_from_people_are_escaped_everywhere() -> None:
     nasty = "<script>alert('x')</script>&\"$x"
-    made = record(stitch(), trainee=nasty, session="<b>")
-    page = session_page(session_report(made, dataclasses.replace(task_of(), title="A <i>task</i> & \"more\"")))
+    made = record((*stitch(), Aborted(**at(1800, tool="<u>"), reason="<s>stop</s>")), trainee=nasty, session="<b>")
+    text = load_task("anastomosis/single-stitch").text.replace('"B"', '"<p>"')
+    task = dataclasses.replace(parse_task(text, "nasty"), title='A <i>task</i> & "more"')
+    page = session_page(session_report(made, task))
     assert "<script" not in page
-    assert "<b>" not in page
-    assert "<i>" not in page
+    for word in ("<b>", "<i>", "<u>", "<s>", "<p>B", "><p></text>"):
+        assert word not in page
+    assert "&lt;p&gt;</text>" in page
     assert "&lt;script&gt;alert(&#x27;x&#x27;)&lt;/script&gt;&amp;&quot;$x" in page
 
 
