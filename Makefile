@@ -31,8 +31,10 @@ format: $(INSTALLED)
 bench: $(INSTALLED)
 	$(TRAINER) bench
 
-docs: $(INSTALLED)
-	$(BIN)/python reports/pictures/draw.py
+# The README's pictures, from a fresh session. Needs a Vulkan driver and Chromium.
+docs: demo
+	$(TRAINER) report session last --db $(DEMO_DB) --html demo/report.html
+	$(BIN)/python reports/pictures/draw.py $(DEMO_RRD) demo/report.html
 
 # The versions that everybody runs. Hashes only: no address of any package index enters the file.
 lock: $(INSTALLED)

@@ -12,18 +12,19 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import typer
 
+#: The exit code that typer makes of Ctrl-C.
+INTERRUPTED = 130
+
 
 def main() -> None:
     """Run the command line; exit code 0 done, 1 failed with a line on stderr, 2 wrong usage."""
-    if sys.argv[1:] == ["--version"]:
-        from trainer import __version__
-
-        print(f"trainer {__version__}")
-        return
     try:
-        build_app()(prog_name="trainer")
+        try:
+            _run()
+        finally:
+            sys.stdout.flush()  # here, where a reader that has gone can still be told from a fault
     except BrokenPipeError:
-        # Who read our output has gone (`trainer sessions list | head -1`); nothing is left to say to them.
+        # `trainer sessions list | head -1`: nothing is left to say, also not when the interpreter flushes.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
     except KeyboardInterrupt:
@@ -32,6 +33,20 @@ def main() -> None:
         if os.environ.get("TRAINER_DEBUG") or not _meant_for_people(error):
             raise
         sys.exit(f"trainer: {_one_line(error)}")
+
+
+def _run() -> None:
+    if sys.argv[1:] == ["--version"]:
+        from trainer import __version__
+
+        print(f"trainer {__version__}")
+        return
+    try:
+        build_app()(prog_name="trainer")
+    except SystemExit as end:
+        if end.code == INTERRUPTED:
+            raise KeyboardInterrupt from None
+        raise
 
 
 def keep_kernels() -> None:
