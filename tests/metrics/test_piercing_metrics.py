@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from tests.metrics.synthetic_session import DRIVE, STITCH, at, pierce, pull_through, record, stitch, task_of, tilted
 from tests.metrics.synthetic_session import withdraw as withdrawn
-from trainer.events import Event, StepDone
+from trainer.events import Event, Pierce, StepDone, Tear
 from trainer.metrics import score
 from trainer.metrics.piercing import angle_to_plane_deg
 
@@ -146,6 +146,20 @@ def test_each_hole_beyond_the_steps_is_extra() -> None:
 def test_a_hole_left_again_is_extra_where_thread_should_stay() -> None:
     tried = pierce(10, pass_number=7)
     assert scores((tried, withdrawn(20, tried), *stitch()))["extra_holes"] == 1.0
+
+
+def test_a_torn_hole_is_extra_where_thread_should_stay() -> None:
+    entry = next(e for e in stitch() if isinstance(e, Pierce))
+    torn = Tear(**at(1500), body="A", wall="outer", hole=entry.hole, point=entry.point, force_mN=160.0, limit_mN=150.0)
+    assert scores((*stitch(), torn))["extra_holes"] == 1.0
+
+
+def test_a_bare_needle_pulled_through_leaves_its_hole_empty() -> None:
+    """Without thread nothing stays: three holes are asked for, and the fourth is extra, kept or not."""
+    through = [pierce(100 * i, pass_number=i) for i in range(1, 5)]
+    events = (*through, *(pull_through(p.tick + 50, p) for p in through))
+    assert scores(events[:3] + events[4:7], DRIVE)["extra_holes"] == 0.0
+    assert scores(events, DRIVE)["extra_holes"] == 1.0
 
 
 def test_the_back_walls_hole_is_extra() -> None:

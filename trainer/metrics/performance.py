@@ -12,7 +12,7 @@ from functools import cached_property
 from typing import TypeVar
 
 from trainer.curriculum import Step, Task, VesselSpec
-from trainer.events import Event, Pierce, PullThrough, StepDone, TaskDone, Withdraw
+from trainer.events import Event, Pierce, PullThrough, StepDone, TaskDone, Tear, Withdraw
 from trainer.log.record import SessionRecord
 from trainer.metrics.track import Track, track
 
@@ -106,13 +106,18 @@ class Performance:
         )
 
     @cached_property
-    def withdrawn(self) -> frozenset[tuple[str, str, int]]:
-        """Holes (body, wall, number) that needle and thread have left."""
-        return frozenset((e.body, e.wall, e.hole) for e in self.events(Withdraw))
+    def emptied(self) -> frozenset[tuple[str, str, int]]:
+        """Holes (body, wall, number) with nothing in them at the end.
+
+        Needle or thread was drawn out again, the wall tore, or a needle without thread went all the way through.
+        """
+        bare = self.task.scene.thread is None
+        kinds = (Withdraw, Tear, PullThrough) if bare else (Withdraw, Tear)
+        return frozenset((e.body, e.wall, e.hole) for e in self.record.events if isinstance(e, kinds))
 
     def is_kept(self, p: Pierce) -> bool:
         """Whether the hole of this crossing still holds needle or thread at the end of the session."""
-        return (p.body, p.wall, p.hole) not in self.withdrawn
+        return (p.body, p.wall, p.hole) not in self.emptied
 
     @cached_property
     def outer_crossings(self) -> tuple[Pierce, ...]:
