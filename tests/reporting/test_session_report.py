@@ -172,11 +172,11 @@ def test_a_dot_lies_at_its_clock_angle_and_bite() -> None:
 
 
 def test_the_strip_places_the_value_on_its_scale() -> None:
-    """Angles run from 0 to 90 degrees over 7 … 143: 45 degrees is the middle, 75."""
+    """Angles run from 0 to 90 degrees over 7 … 125: 45 degrees is the middle, 66."""
     inside = svg_of(figures.strip(row(45.0, 30.0, 60.0, "deg")))[0]
     dot = inside.find("{http://www.w3.org/2000/svg}circle")
     assert dot is not None
-    assert float(dot.attrib["cx"]) == pytest.approx(75.0)
+    assert float(dot.attrib["cx"]) == pytest.approx(66.0)
     outside = svg_of(figures.strip(row(10.0, 30.0, 60.0, "deg")))[0]
     assert outside.find("{http://www.w3.org/2000/svg}polygon") is not None
 

@@ -43,7 +43,7 @@ def error_colour(error_deg: float | None) -> str:
 
 def strip(row: MetricRow, earlier: tuple[float, ...] = ()) -> str:
     """The value on a scale with its target band; earlier values are small and grey."""
-    width, height, pad = 150.0, 22.0, 7.0
+    width, height, pad = 132.0, 22.0, 7.0
     limits = [v for v in (row.target_low, row.target_high) if v is not None]
     seen = [v for v in (row.value, *earlier) if v is not None]
     top = 90.0 if row.unit == "deg" else ticks(0.0, max(1.25 * max([*limits, *seen], default=1.0), 1e-9), 4)[-1]
@@ -80,7 +80,8 @@ def stitch_map(shown: StitchMap) -> str:
     width, height = max(size * len(shown.vessels), 300.0), 246.0  # the legend is 300 wide
     farthest = max([0.5, *(b.bite_mm for b in shown.bites), *(m.bite_mm for m in shown.marks)])
     rings = ticks(0.0, farthest, 3)
-    centres = {v: (0.5 * width + size * (i + 0.5 - 0.5 * len(shown.vessels)), 106.0) for i, v in enumerate(shown.vessels)}
+    left = 0.5 * (width - size * len(shown.vessels))
+    centres = {v: (left + size * (i + 0.5), 106.0) for i, v in enumerate(shown.vessels)}
 
     def place(vessel: str, clock_deg: float, bite_mm: float) -> tuple[float, float]:
         radius = edge + (rim - edge) * max(bite_mm, 0.0) / rings[-1]
@@ -216,7 +217,7 @@ def learning_curve(curve: Curve, attempts: int) -> str:
                               stroke_width=1.2, stroke_dasharray="5 3"))  # fmt: skip
     points = [(x(n), y(v)) for n, v in zip(curve.attempts, curve.values, strict=True)]
     parts.append(polyline(points, stroke=BLUE, stroke_width=1, stroke_opacity=0.45))
-    if curve.recent is not None:
+    if curve.recent is not None and len(curve.values) > 1:
         a, b = x(curve.attempts[-3:][0] - 0.4), x(curve.attempts[-1] + 0.4)
         parts.append(line(a, y(curve.recent), b, y(curve.recent), stroke=VERMILLION, stroke_width=2.4))
     parts += [

@@ -22,6 +22,7 @@ MAP_CAPTION = (
     "Each vessel end around its cut edge, 3 o'clock on the same side of both. Distance from the inner circle is the "
     "bite in mm; the number is the pass; a dot with a dashed edge was left again."
 )
+COMPLETED_ONLY = "Curves and best values count completed attempts only; the others stopped at another place."
 
 
 class Sources:
@@ -90,7 +91,7 @@ def progress_page(report: ProgressReport) -> str:
         count=f"{attempts} session{'s' if attempts != 1 else ''}",
         period=first if first == last else f"{first} to {last}",
         tasks=tasks,
-        footer=sources.footnotes() + _closing({}, 0),
+        footer=sources.footnotes() + f"<p>{COMPLETED_ONLY}</p>" + _closing({}, 0),
     )
 
 

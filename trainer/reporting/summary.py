@@ -24,14 +24,16 @@ def task_summary(task: TaskProgress) -> str:
     rows = [r.last for r in task.rows if r.last.has_target]
     met = sum(r.met is True for r in rows)
     tried = f"{len(task.attempts)} attempt{'s' if len(task.attempts) != 1 else ''}, {task.completed} completed."
-    return f"{tried} The last one met {met} of {len(rows)} targets."
+    return f"{tried} The last attempt met {met} of {len(rows)} targets."
 
 
 def curve_words(curve: Curve) -> str:
     """What the attempts so far can tell."""
     if curve.recent is None:
         return "No completed attempt."
-    said = f"Median of the last {min(3, len(curve.values))}: {wording.quantity(curve.recent, curve.unit)}."
+    few = len(curve.values)
+    over = "One completed attempt" if few == 1 else f"Median of the last {min(3, few)} completed"
+    said = f"{over}: {wording.quantity(curve.recent, curve.unit)}."
     if curve.trend is None:
         return said + " Three completed attempts are needed for a slope."
     unit = wording.unit_word(curve.unit)
