@@ -99,6 +99,12 @@ def test_a_file_can_be_read_in_one_sitting(module: Path) -> None:
     assert len(module.read_text(encoding="utf-8").splitlines()) <= 500
 
 
+def test_no_two_test_files_share_a_name() -> None:
+    """They are imported by their names alone: of two that share one, the second would not be collected."""
+    names = [path.name for path in (ROOT / "tests").rglob("test_*.py")]
+    assert sorted(names) == sorted(set(names))
+
+
 def started(arguments: list[str]) -> set[str]:
     """The top-level modules that a run of the command line has imported when it ends."""
     code = (
