@@ -281,7 +281,7 @@ sink = LogSink(path, header(sys.argv[2]))
 if sys.argv[3] == "limit":
     resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))
 else:
-    (path.parent / "ballast").write_bytes(b"0" * 200_000)
+    (path.parent / "ballast").write_bytes(b"0" * 2_000_000)
 try:
     for tick in range(1_000_000):
         sink.tick(step(tick, *(pierce(tick, i) for i in range(20))))
@@ -321,12 +321,12 @@ def test_a_file_that_may_not_grow_is_told_in_one_line_and_costs_nothing_written(
 def test_a_full_disk_is_told_in_one_line_and_costs_nothing_written(tmp_path: Path) -> None:
     disk = tmp_path / "disk"
     disk.mkdir()
-    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(disk)], check=False).returncode:
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=3m", "tmpfs", str(disk)], check=False).returncode:
         pytest.skip("this machine lets nobody mount a disk")
     try:
         process = in_subprocess(FILLS_THE_DISK, str(disk / "s.db"), SESSION, "disk")
         process.wait()
-        (disk / "ballast").unlink()  # room for what follows
+        (disk / "ballast").unlink()  # room for all that waits in the write-ahead file, a second time
         assert_told_and_kept(disk / "s.db", process, "the disk is full")
     finally:
         subprocess.run(["umount", str(disk)], check=True)
