@@ -38,7 +38,7 @@ class Grasp(Event):
     body: str  # vessel, or ""
     arc_mm: float  # along needle and thread from the needle's tip; 0 for a wall
     point: Vector
-    force_mN: float  # normal force of the jaws
+    force_mN: float  # the pull that this grip resists
 
 
 @dataclass(frozen=True)

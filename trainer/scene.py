@@ -113,6 +113,7 @@ class Scene:
         world.tick, world.events = self.tick, []
         if self.tick == 0:
             world.emit(TaskStarted, 0.0, "", task=task.name)
+            grasp.report_held(world, 0.0)
         targets, closures = self._tracked(poses, start_s)
         starts, from_closures = [j.pose for j in world.jaws], np.array([j.closure for j in world.jaws])
         movements = self._movements(starts, targets)
@@ -250,7 +251,7 @@ class Scene:
         blades = forceps.parts()
         return Layout(
             surfaces=tuple(
-                Surface(f"vessel/{v.spec.name}", v.display_triangles, (196, 78, 72, 255)) for v in self._vessels()
+                Surface(f"vessel/{v.spec.name}", v.display_triangles, (226, 120, 110, 205)) for v in self._vessels()
             ),
             parts=tuple(
                 InstrumentPart(f"{tool}/{blade.name}", i, blade.vertices, blade.triangles)

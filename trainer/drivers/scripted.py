@@ -22,12 +22,13 @@ from trainer.view import HoleView, View
 Movement = Iterator[None]  # yields once per tick
 
 PRESS = 0.25  # speed while the needle goes through a wall, as a share of the hand's speed
+AIMED_MM = 0.03  # this near to the place aimed at the tip goes straight on
 RUN_UP_MM = 0.4  # the tip's distance from the wall at which pressing begins
 STEER_DEG = 50.0  # inside a lumen the needle is steered to this angle, to leave by the cut end
 STAND_OFF_MM = 1.5  # an instrument's distance before it reaches for something
 CLEAR_MM = 2.5  # distance from a vessel's axis while moving round it
-ASIDE_DEG = 40.0  # at most this far from the vessel's axis lies the needle's plane, so that it passes the other end
-ASIDE_MM = 0.22  # and at most this far from the axis it leaves the lumen
+ASIDE_DEG = 40.0  # at most this far from the vessel's axis lies the needle's plane
+CLEAR_PAST_MM = 0.06  # distance at which the needle passes the other end of the vessel
 BITE_DEPTH_MM = 2.0  # arc beyond a hole at which the other hand takes over
 TAKE_AT_MM = 0.6  # distance from the tip at which the other hand takes the needle
 RISE = 0.4  # how steeply the thread is pulled away from the vessels
@@ -113,7 +114,7 @@ class ScriptedHands:
         clock += math.degrees(self._rng.normal(0.0, hand.aim_error_mm) / radius)
         angle = 90.0 if hand.entry_angle_deg is None else hand.entry_angle_deg
         angle = 90.0 - abs(90.0 - angle - self._rng.normal(0.0, hand.entry_angle_error_deg))
-        aside = min(math.radians(ASIDE_DEG), math.atan2(ASIDE_MM, bite))
+        aside = self._aside(bite)
         if step.direction == "out":
             angle = min(angle, _steepest_from_lumen(bite, aside, radius, vessel.wall_mm, self._radius))
         if driving != 1 and through:
@@ -169,7 +170,7 @@ class ScriptedHands:
             target, normal = self._view.look(vessel, clock, bite, "outer")
             tangent, inward = self._heading_out(vessel, normal, angle, aside)
             way = target - self._needle().position
-            aim = unit(way) if np.linalg.norm(way) > 0.03 else tangent
+            aim = unit(way) if way @ tangent > AIMED_MM else tangent
             tip = tip + self._press_step() * aim
             travelled += self._press_step()
             if travelled > run + wall / math.sin(angle) + 1.5:
@@ -231,7 +232,7 @@ class ScriptedHands:
     def _pull_tail(self, step: Step) -> Movement:
         tool = self._holder()
         last = [s.vessel for s in self._task.step if s.kind == "drive"][-1]
-        away = self._across(last, self._needle().position)
+        away = self._across(last)
         aim = 0.75 * step.at_most_mm
         while self._view.tail_mm > aim:
             self._pose[tool] = Rigid(
@@ -256,7 +257,7 @@ class ScriptedHands:
         if tool not in self._view.thread_holders:
             raise _Lost("the thread was not caught")
         first = next(s.vessel for s in self._task.step if s.kind == "drive")
-        direction = self._across(first, point)
+        direction = self._across(first)
         pulled = 0.0
         done = self._view.steps_done
         while self._view.steps_done == done:
@@ -416,6 +417,15 @@ class ScriptedHands:
     def _task_vessel(self, name: str):  # type: ignore[no-untyped-def]
         return next(v for v in self._task.scene.vessel if v.name == name)
 
+    def _aside(self, bite: float) -> float:
+        """Angle (rad) between the needle's plane and the vessel's axis that takes the needle past the other end."""
+        ends = self._task.scene.vessel
+        if len(ends) < 2:
+            return math.radians(ASIDE_DEG)
+        gap = math.dist(ends[0].cut_edge_mm, ends[1].cut_edge_mm)
+        radius = 0.5 * max(v.outer_diameter_mm for v in ends)
+        return min(math.radians(ASIDE_DEG), math.atan2(radius + CLEAR_PAST_MM, bite + gap))
+
     def _vessel_origin(self, vessel: str) -> tuple[Array, Array]:
         """The centre of the cut edge and a point of the wall at 12 o'clock, both as seen now."""
         top, _ = self._view.look(vessel, 0.0, 0.0, "outer")
@@ -433,9 +443,12 @@ class ScriptedHands:
         vessel = self._task.scene.vessel[0].name
         return self._outward(vessel, self._needle().position)
 
-    def _across(self, vessel: str, point: Array) -> Array:
-        """From a vessel's wall across the cut to the other end, rising: pulled that way a thread closes the gap."""
-        return unit(RISE * self._outward(vessel, point) - self._view.vessel_axis[vessel])
+    def _across(self, vessel: str) -> Array:
+        """From a vessel's hole across the cut to the other end, rising: pulled that way a thread closes the gap."""
+        stitched = [h.point for h in self._view.holes if h.vessel == vessel and h.wall == "outer"]
+        if not stitched:
+            raise _Lost("the thread is not in the wall")
+        return unit(RISE * self._outward(vessel, stitched[-1]) - self._view.vessel_axis[vessel])
 
     def _heading_in(self, vessel: str, normal: Array, steep: float, aside: float) -> tuple[Array, Array]:
         """Tangent and inward direction of a needle that dives at ``steep`` rad and turns towards the cut end."""

@@ -10,6 +10,8 @@ from trainer.geometry import Array
 # A crossing on the common edge of two triangles must belong to at least one of them: weights may be
 # negative by this much, which on a triangle of 0.1 mm is a tenth of a nanometre.
 EDGE_TOLERANCE = 1e-6
+# Boxes this far apart are still compared (mm), so that rounding opens no gap between two triangles.
+NEAR_MM = 1e-6
 # Halvings of the tick in the search for the crossing: 2**-50 of a 10 ms tick is far below rounding.
 HALVINGS = 50
 
@@ -39,7 +41,7 @@ def _first(p0, p1, x0, x1, triangles, skip, weights):  # type: ignore[no-untyped
             high = max(p0[d], p1[d])
             tl = min(min(min(x0[i, d], x1[i, d]), min(x0[j, d], x1[j, d])), min(x0[k, d], x1[k, d]))
             th = max(max(max(x0[i, d], x1[i, d]), max(x0[j, d], x1[j, d])), max(x0[k, d], x1[k, d]))
-            if high < tl or low > th:
+            if high < tl - NEAR_MM or low > th + NEAR_MM:
                 apart = True
                 break
         if apart:

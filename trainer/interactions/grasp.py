@@ -48,7 +48,7 @@ def let_go(world: World, jaw: Jaw) -> None:
     for slot in jaw.slots:
         assert world.solver is not None
         world.solver.drop(slot)
-    jaw.target, jaw.tool_from_needle, jaw.slots, jaw.vessel = "", None, (), -1
+    jaw.target, jaw.tool_from_needle, jaw.slots, jaw.points, jaw.vessel = "", None, (), np.zeros((0, 3)), -1
 
 
 def hold_needle(world: World, tool: int, arc: float) -> None:
@@ -57,6 +57,13 @@ def hold_needle(world: World, tool: int, arc: float) -> None:
     jaw.target, jaw.arc = "needle", arc
     jaw.since = 1 + max(j.since for j in world.jaws)
     jaw.tool_from_needle = jaw.pose.inverse() @ world.needle_pose
+
+
+def report_held(world: World, time_s: float) -> None:
+    """Write a grasp for what the jaws hold as the exercise begins."""
+    for i, jaw in enumerate(world.jaws):
+        if jaw.target:
+            _grasped(world, i, _body(world, jaw), jaw.arc, capacity_mN(world, i), time_s)
 
 
 def capacity_mN(world: World, tool: int) -> float:
@@ -92,18 +99,17 @@ def second_grips(world: World, time_s: float) -> None:
 def _catch(world: World, tool: int, jaw: Jaw, spec: InstrumentSpec, time_s: float) -> None:
     """Grasp the needle, else the thread, else a wall: the first that lies within reach of the jaws' centre."""
     centre = jaw.pose.position
-    force = spec.grip_mN.value * (jaw.closure - spec.open_at) / (1.0 - spec.open_at)
     if world.needle is not None:
         distance, arc = needle_closest(world.needle, world.needle_pose.inverse().apply(centre))
         if distance <= spec.reach_mm:
             hold_needle(world, tool, arc)
-            _grasped(world, tool, "", arc, force, time_s)
+            _grasped(world, tool, "", arc, capacity_mN(world, tool), time_s)
             return
     if world.thread is not None:
         distance, arc = thread_point(world, centre)
         if distance <= spec.reach_mm:
             jaw.target, jaw.arc = "thread", arc
-            _grasped(world, tool, "", arc, force, time_s)
+            _grasped(world, tool, "", arc, capacity_mN(world, tool), time_s)
             return
     _catch_wall(world, tool, jaw, spec, time_s)
 
@@ -126,7 +132,7 @@ def _catch_wall(world: World, tool: int, jaw: Jaw, spec: InstrumentSpec, time_s:
     jaw.target, jaw.vessel = "wall", vessel
     jaw.slots = tuple(world.solver.hold(c.nodes, c.weights) for c in corners)
     jaw.points = jaw.pose.inverse().apply(world.solver.x[nodes])
-    _grasped(world, tool, _body(world, jaw), 0.0, pressure_kPa(world, tool) * PAD_MM2, time_s)
+    _grasped(world, tool, _body(world, jaw), 0.0, capacity_mN(world, tool), time_s)
 
 
 def _grasped(world: World, tool: int, body: str, arc: float, force: float, time_s: float) -> None:

@@ -21,6 +21,8 @@ from trainer.interactions.world import Hole, Place, TipContact, World, vector
 
 #: A tip pushed hard but not along itself goes through as well, at this many puncture forces (assumed).
 SIDEWAYS = 2.0
+#: A tip that lifts off a wall and is back this soon, s, has never left it: one touch, one event (assumed).
+SAME_TOUCH_S = 0.1
 #: Needle behind the tip, mm, up to which the wall next to its hole counts as already crossed.
 JUST_THROUGH_MM = 0.4
 
@@ -43,9 +45,12 @@ def detect(world: World, before: Rigid, after: Rigid, start_s: float, span_s: fl
     normal, _ = world.undented(place)
     slot = world.solver.hold(place.nodes, place.weights)
     world.contact = TipContact(place, slot, inwards, _sticks(world, after, normal), fraction, 0.0, normal)
+    now, last = start_s + fraction * span_s, world.touched.get((place.vessel, place.wall), -math.inf)
+    if now - last < SAME_TOUCH_S:
+        return
     point = before.position + fraction * (after.position - before.position)
     world.emit(
-        Contact, start_s + fraction * span_s, tool, body=world.vessel_name(place), wall=place.wall,
+        Contact, now, tool, body=world.vessel_name(place), wall=place.wall,
         direction="in" if inwards else "out", point=vector(point), axial_mm=place.axial_mm,
         clock_deg=math.degrees(place.clock),
     )  # fmt: skip
@@ -77,6 +82,7 @@ def puncture(
     normal, surface = world.undented(contact.place)
     pressing = -normal if contact.inwards else normal
     tangent = after.rotate(np.array([1.0, 0.0, 0.0]))
+    world.touched[contact.place.vessel, contact.place.wall] = start_s + span_s
     if force @ pressing < 0.0:
         world.solver.drop(contact.slot)
         world.contact = None

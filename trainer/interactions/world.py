@@ -95,6 +95,7 @@ class World:
     nodes: Array = field(default_factory=lambda: np.zeros((0, 3)))  # of the thread
     pieces: Array = field(default_factory=lambda: np.zeros((0, 2)))  # of the thread
     contact: TipContact | None = None
+    touched: dict[tuple[int, str], float] = field(default_factory=dict)  # (vessel, wall) → time of the tip's last touch
     holes: list[Hole] = field(default_factory=list)
     passes: int = 0
     before: Array = field(default_factory=lambda: np.zeros((0, 3)))  # tissue before its last movement
