@@ -34,7 +34,7 @@ bench: $(INSTALLED)
 # The README's pictures, from a fresh session. Needs a Vulkan driver and Chromium.
 docs: demo
 	$(TRAINER) report session last --db $(DEMO_DB) --html demo/report.html
-	$(BIN)/python reports/pictures/draw.py $(DEMO_RRD) demo/report.html
+	$(BIN)/python reports/pictures/draw.py $(DEMO_RRD) demo/report.html --at 3
 
 # The versions that everybody runs. Hashes only: no address of any package index enters the file.
 lock: $(INSTALLED)
