@@ -46,7 +46,7 @@ def quaternion_multiply(a: ArrayLike, b: ArrayLike) -> Array:
 
 def quaternion_conjugate(q: ArrayLike) -> Array:
     """The inverse rotation of unit quaternion(s) ``(..., 4)``."""
-    return np.asarray(q, dtype=np.float64) * np.array([1.0, -1.0, -1.0, -1.0])
+    return np.asarray(np.asarray(q, dtype=np.float64) * np.array([1.0, -1.0, -1.0, -1.0]))
 
 
 def quaternion_from_axis_angle(axis: ArrayLike, angle: float) -> Array:
