@@ -7,12 +7,16 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 from trainer.cli.main import keep_kernels, main
 
 CommandLine = Callable[..., tuple[int, str, str]]
 
 keep_kernels()
+# The first example may compile a kernel, and the machines are shared: no example is timed.
+settings.register_profile("untimed", deadline=None)
+settings.load_profile("untimed")
 
 
 @pytest.fixture(autouse=True)
