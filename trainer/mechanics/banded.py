@@ -62,19 +62,20 @@ def factor_band(
     inverse: Array,
     first: int,
     last: int,
+    least: float,
 ) -> int:
     """L D Lᵀ of ``band`` (overwritten), L with unit diagonal: the columns ``first`` … ``last`` - 1, given those before.
 
     ``columns[j, k]`` is L[j + 1 + k, j], ``rows[j, k]`` is L[j, j - b + k], ``inverse[j]`` is 1 / D[j]. A pivot that
-    is not a SINGULAR share of ``diagonal`` (3 f,), the band's own before, is replaced by it, which makes the factor
-    that of a stiffer, positive definite matrix. Returns how often that was done.
+    is below the share ``least`` of ``diagonal`` (3 f,), the band's own before, is replaced by it, so that the rest
+    stays finite. Returns how often that was done: unless it is 0, the factor is that of another matrix.
     """
     n, width = band.shape
     b = width - 1
     replaced = 0
     for j in range(first, last):
         pivot = band[j, 0]
-        if not pivot > SINGULAR * diagonal[j]:
+        if not pivot > least * diagonal[j]:
             pivot = diagonal[j]
             replaced += 1
         inverse[j] = 1.0 / pivot
@@ -146,13 +147,13 @@ class Factoring:
         columns, rows = np.zeros((2, size, b), dtype=np.float32)
         self.factor = BandedFactor(np.ascontiguousarray(order, dtype=np.int32), columns, rows, np.zeros(size))
         self._next = 0
-        self.replaced = 0
+        self.replaced = 0  # pivots that were too small: the factor is of no use
 
-    def advance(self, count: int) -> bool:
-        """Eliminates ``count`` more unknowns; True when ``factor`` is complete."""
+    def advance(self, count: int, least: float = SINGULAR) -> bool:
+        """Eliminates ``count`` more unknowns; True when ``factor`` is complete. ``least``: see factor_band."""
         f = self.factor
         last = min(self._next + count, len(f.inverse))
-        self.replaced += factor_band(self._band, self._diagonal, f.columns, f.rows, f.inverse, self._next, last)
+        self.replaced += factor_band(self._band, self._diagonal, f.columns, f.rows, f.inverse, self._next, last, least)
         self._next = last
         return last == len(f.inverse)
 

@@ -14,7 +14,9 @@ from trainer.mechanics.links import LinkMesh, link_blocks
 from trainer.mechanics.quasi_newton import at_points
 
 #: Slices into which a new factorisation is divided.
-SLICES = 24
+SLICES = 12
+#: At rest no pivot is below 0.4 of the diagonal. A state in which one is below this is nearly or truly unstable.
+LEAST_PIVOT = 0.05
 
 
 class Compliance:
@@ -42,7 +44,9 @@ class Compliance:
         self.matrix = np.zeros((0, 0))  # W K⁻¹ Wᵀ over all slots
         self._age = [0] * len(orders)  # how many factors ago each body's was made
         self._under_way: tuple[int, banded.Factoring] | None = None
-        self._ready: dict[int, Array] = {}
+        self._at = mesh.rest
+        self._projected = False
+        self._ready: dict[int, Array] = {}  # columns for the factor under way
 
     def body_of(self, node: np.ndarray | int) -> np.ndarray:
         """The body to which a node (or each of some nodes) belongs."""
@@ -73,17 +77,20 @@ class Compliance:
         if self._under_way is not None or not bodies:
             return
         body = max(bodies, key=lambda b: (self._age[b], -b))
-        m = self._mesh
-        link_blocks(x, m.links, m.rest_length, m.stiffness, False, self._blocks)
-        order = self._orders[body]
-        self._under_way = body, banded.Factoring(self._blocks, m.links, order, len(m.rest))
+        self._under_way = body, self._factoring(body, x, project=False)
+        self._at = x.copy()
 
     def advance(self) -> None:
         """One slice of the work that :meth:`refresh` began; the last one changes the factor and the columns."""
         if self._under_way is None:
             return
         body, work = self._under_way
-        if not work.advance(-(-len(work.factor.inverse) // SLICES)):
+        complete = work.advance(-(-len(work.factor.inverse) // SLICES), LEAST_PIVOT)
+        if work.replaced and not self._projected:
+            # Shortened links make the plain stiffness indefinite here; without their softening it is not.
+            self._under_way = body, self._factoring(body, self._at, project=True)
+            return
+        if not complete:
             return
         held = np.flatnonzero((self.slot_range[:, 0] == self.nodes[body][0]) & np.any(self.slot_weights != 0.0, axis=1))
         waiting = [int(s) for s in held if int(s) not in self._ready]
@@ -98,6 +105,12 @@ class Compliance:
         self._age = [0 if b == body else age + 1 for b, age in enumerate(self._age)]
         self._under_way = None
         self._ready = {}
+
+    def _factoring(self, body: int, x: Array, project: bool) -> banded.Factoring:
+        m = self._mesh
+        link_blocks(x, m.links, m.rest_length, m.stiffness, project, self._blocks)
+        self._projected = project
+        return banded.Factoring(self._blocks, m.links, self._orders[body], len(m.rest))
 
     def _answers(self, slot: int, factor: banded.BandedFactor) -> Array:
         """The displacements (3, n, 3) of all nodes by a unit force on the slot along x, y and z."""

@@ -148,7 +148,7 @@ class Equilibrium:
             tolerance = tolerance_mN if step == steps else STEP_TOLERANCE * tolerance_mN
             converged, used = self._minimise(rows, work, tolerance, max_iterations)
             iterations += used
-        if iterations > steps * SLOW:
+        if iterations > steps * SLOW or not converged:
             self.compliance.refresh(work.awake, self.x)
         self.compliance.advance()
         self._last_target = {int(s): t.copy() for s, t in zip(anchors.slot, rows.target, strict=True)}
@@ -293,6 +293,8 @@ class Equilibrium:
                 self._count = 0
                 d = self._direction(rows, work, g, 0)
                 slope = dot(g, d, lo, hi)
+                if not slope > 0.0:
+                    return False, iteration
             longest = float(np.max(np.abs(d[lo:hi])))
             t = 1.0 if longest <= self._step_limit else self._step_limit / longest
             self._old_force[lo:hi] = self._force[lo:hi]
@@ -305,7 +307,7 @@ class Equilibrium:
                 if new_energy <= energy - DECREASE * t * slope + noise:
                     break
                 t *= 0.5
-                if t < SHORTEST_STEP:
+                if not t >= SHORTEST_STEP:
                     self._evaluate(rows, work, self.x)
                     self._gradient(work)
                     return False, iteration
