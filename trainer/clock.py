@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import time
 from array import array
+from collections.abc import Sequence
 
 #: Behind by more than this, a session in real time goes on from where it is (the machine slept, say):
 #: running the missed ticks in a burst would move the scene under the trainee's hands. Assumed.
@@ -27,26 +28,19 @@ class Fast:
         self.tick_hz = tick_hz
         self.slot_ms = 1e3 / tick_hz
         self._begun_ns = 0
-        self._work_ms = array("d")
+        self.work_ms = array("d")  # of every tick so far
 
     def begin(self) -> None:
         self._begun_ns = time.perf_counter_ns()
 
     def end(self) -> float:
         work_ms = (time.perf_counter_ns() - self._begun_ns) * 1e-6
-        self._work_ms.append(work_ms)
+        self.work_ms.append(work_ms)
         return work_ms
 
     def report(self) -> dict[str, float]:
-        """Work per tick: ``overruns`` is the number of ticks that took longer than their slot of 1 / ``tick_hz``."""
-        ordered = sorted(self._work_ms)
-        return {
-            "tick_hz": self.tick_hz,
-            "overruns": sum(ms > self.slot_ms for ms in ordered),
-            "p50_ms": _percentile(ordered, 0.50),
-            "p99_ms": _percentile(ordered, 0.99),
-            "max_ms": ordered[-1] if ordered else 0.0,
-        }
+        """Work per tick, see :func:`pace`."""
+        return pace(self.tick_hz, self.work_ms)
 
 
 class Realtime(Fast):
@@ -64,12 +58,24 @@ class Realtime(Fast):
 
     def begin(self) -> None:
         now = time.perf_counter()
-        if not self._work_ms or now - self._due_s > LARGEST_LAG_S:
+        if not self.work_ms or now - self._due_s > LARGEST_LAG_S:
             self._due_s = now
         elif now < self._due_s:
             time.sleep(self._due_s - now)
         self._due_s += 1.0 / self.tick_hz
         super().begin()
+
+
+def pace(tick_hz: float, work_ms: Sequence[float]) -> dict[str, float]:
+    """Work per tick: ``overruns`` is the number of ticks that took longer than their slot of 1 / ``tick_hz``."""
+    ordered = sorted(work_ms)
+    return {
+        "tick_hz": tick_hz,
+        "overruns": sum(ms > 1e3 / tick_hz for ms in ordered),
+        "p50_ms": _percentile(ordered, 0.50),
+        "p99_ms": _percentile(ordered, 0.99),
+        "max_ms": ordered[-1] if ordered else 0.0,
+    }
 
 
 def _percentile(ordered: list[float], fraction: float) -> float:

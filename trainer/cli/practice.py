@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import asdict
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
+    from trainer.clock import Fast
     from trainer.curriculum import TaskFile
     from trainer.log.record import SessionHeader
     from trainer.profile import ProfileFile
@@ -40,6 +42,7 @@ def practice(
     if record is not None and record.suffix != ".rrd":
         raise typer.BadParameter(f"--record needs a name that ends in .rrd, found {record}")
 
+    from trainer.clock import Fast, Realtime
     from trainer.curriculum import load_task
     from trainer.log.schema import default_db_path, new_session_id
 
@@ -47,8 +50,9 @@ def practice(
     log_path = db or default_db_path()
     recording = None if no_record else record or log_path.parent / "recordings" / f"{session_id}.rrd"
     task_file = load_task(task)
+    clock = (Realtime if realtime else Fast)(task_file.task.tick_hz)
     with ExitStack() as stack:
-        result = _perform(stack, task_file, session_id, trainee, device, seed, realtime, log_path, recording)
+        result = perform(stack, task_file, session_id, trainee, device, seed, clock, log_path, recording)
         if as_json:
             print(json.dumps(result, indent=2, allow_nan=False))
         else:
@@ -58,25 +62,26 @@ def practice(
     # A recording that could not be finished says so here, when everything else is stored and printed.
 
 
-def _perform(
+def perform(
     stack: ExitStack,
     task_file: TaskFile,
     session_id: str,
     trainee: str,
     device: str,
     seed: int,
-    realtime: bool,
+    clock: Fast,
     log_path: Path,
     recording_path: Path | None,
+    enough: Callable[[], bool] = lambda: False,
 ) -> dict[str, Any]:
     """Run one exercise and store it; the document that ``--json`` prints. ``stack`` closes what was opened.
 
+    ``clock`` is a fresh one at the task's rate. ``enough``, asked once in each tick, ends the session like Ctrl-C.
     Whatever can be refused is refused before the session enters the log. Raises ConfigError for a task or
     device that cannot be used, LogError and RecordingError where they cannot be written.
     """
     from trainer.cli.progress import Progress
     from trainer.cli.warmup import announce, warm_up
-    from trainer.clock import Fast, Realtime
     from trainer.drivers import open_driver
     from trainer.metrics.registry import check_targets, score
     from trainer.scene import build
@@ -94,18 +99,17 @@ def _perform(
     scene = build(task)
     profile, driver = open_driver(device, task, scene.home, seed)
     stack.enter_context(closing(driver))
-    if realtime:
+    if clock.realtime:
         warm_up(task)
-    clock = (Realtime if realtime else Fast)(task.tick_hz)
     header = _header(session_id, trainee, task_file, profile, seed, scene.tools, recording_path)
     sinks: list[Sink] = []
     recording = None
     if recording_path is not None:
-        recording = RecordingSink(recording_path, header, scene.layout(), task.tick_hz, realtime=realtime)
+        recording = RecordingSink(recording_path, header, scene.layout(), task.tick_hz, realtime=clock.realtime)
         sinks.append(stack.enter_context(closing(recording)))
     log = stack.enter_context(closing(LogSink(log_path, header)))
     with closing(Progress(task)) as progress, interruptible() as interrupted:
-        run(scene, driver, [log, *sinks, progress], clock, interrupted)
+        run(scene, driver, [log, *sinks, progress], clock, lambda: interrupted() or enough())
     duration_s = scene.tick / task.tick_hz
     stored = log.record(scene.outcome, scene.tick, duration_s)
     metrics = score(stored, task)
@@ -139,13 +143,8 @@ def _header(
     tools: tuple[str, ...],
     recording: Path | None,
 ) -> SessionHeader:
-    import platform
     from datetime import UTC, datetime
 
-    import numba
-    import numpy as np
-
-    from trainer import __version__
     from trainer.log.record import SessionHeader
 
     return SessionHeader(
@@ -161,15 +160,27 @@ def _header(
         tick_hz=task_file.task.tick_hz,
         tools=tools,
         started_at=datetime.now(UTC).isoformat(timespec="milliseconds"),
-        versions={
-            "trainer": __version__,
-            "python": platform.python_version(),
-            "numpy": np.__version__,
-            "numba": numba.__version__,
-            "machine": f"{platform.system()} {platform.machine()}",
-        },
+        versions=versions(),
         recording=None if recording is None else str(recording),
     )
+
+
+def versions() -> dict[str, str]:
+    """What a session's numbers depend on, for its header."""
+    import platform
+
+    import numba
+    import numpy as np
+
+    from trainer import __version__
+
+    return {
+        "trainer": __version__,
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "numba": numba.__version__,
+        "machine": f"{platform.system()} {platform.machine()}",
+    }
 
 
 def _make_room(recording: Path) -> None:

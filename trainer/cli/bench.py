@@ -1,0 +1,112 @@
+"""``trainer bench``: how fast the program is on this machine, and how right."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from trainer.cli.sessions import JsonOption
+
+if TYPE_CHECKING:
+    from trainer.clock import Realtime
+
+app = typer.Typer(help="Measure the program on this machine; without a command a short run of all.")
+
+
+@app.callback(invoke_without_command=True)
+def everything(context: typer.Context) -> None:
+    """Measure the program on this machine; without a command a short run of all."""
+    if context.invoked_subcommand is None:
+        speed_error(quick=True)
+        print()
+        realtime(seconds=10.0)
+
+
+@app.command()
+def realtime(
+    seconds: Annotated[float, typer.Option(min=0.1, help="How long.")] = 60.0,
+    task: Annotated[str, typer.Option(metavar="FAMILY/TASK", help="What to run.")] = "anastomosis/single-stitch",
+    as_json: JsonOption = False,
+) -> None:
+    """Run a task in real time, log and recording included, and tell the work of its ticks."""
+    from contextlib import ExitStack
+    from tempfile import TemporaryDirectory
+
+    from trainer.bench.machine import in_words
+    from trainer.bench.realtime import measure
+    from trainer.cli.practice import perform
+    from trainer.curriculum import load_task
+    from trainer.log.schema import new_session_id
+
+    task_file = load_task(task)
+    about = _machine()
+    with TemporaryDirectory(prefix="trainer-bench-") as folder:
+
+        def session(seed: int, clock: Realtime, enough: Callable[[], bool]) -> str:
+            session_id = new_session_id()
+            log_path, recording = Path(folder) / "log.db", Path(folder) / f"{session_id}.rrd"
+            with ExitStack() as stack:
+                done = perform(
+                    stack, task_file, session_id, "bench", "scripted-expert", seed, clock, log_path, recording, enough
+                )
+            return str(done["outcome"])
+
+        found = measure(session, task_file.task.tick_hz, seconds)
+    nodes = sum(2 * vessel.layers * vessel.around for vessel in task_file.task.scene.vessel)
+    result = {"task": task_file.path, "nodes": nodes, **found, "machine": about}
+    if as_json:
+        print(json.dumps(result, indent=2, allow_nan=False))
+        return
+    print(f"{result['task']} in real time: {nodes} nodes, {found['ticks']} ticks at {found['tick_hz']:g} Hz")
+    print(f"sessions       {', '.join(found['sessions'])}")
+    print(
+        f"work per tick  median {found['p50_ms']:.2f} ms, 99 % within {found['p99_ms']:.2f} ms, "
+        f"longest {found['max_ms']:.2f} ms"
+    )
+    print(f"overruns       {found['overruns']}")
+    print(f"machine        {in_words(about)}")
+
+
+@app.command("speed-error")
+def speed_error(
+    quick: Annotated[bool, typer.Option("--quick", help="Below a minute: without the longest relaxation.")] = False,
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Where the report goes; by default reports/ if it is here.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Time against error of the ways to a vessel's equilibrium; writes speed_error.md, .svg and .json."""
+    from trainer.bench import page
+    from trainer.bench.speed_error import measure
+    from trainer.cli.sessions import print_table
+    from trainer.cli.warmup import announce
+
+    folder = out or (Path("reports") if Path("reports").is_dir() else Path())
+    announce()
+    about = _machine()
+    rows, order = measure(quick)
+    written = page.write(folder, rows, order, about, quick)
+    if as_json:
+        print(json.dumps(page.document(rows, order, about, quick), indent=2, allow_nan=False))
+    else:
+        print_table(
+            ("case", "nodes", "method", "setting", "median ms", "p90 ms", "error / R", "residual mN", "status"),
+            [
+                (r.case, str(r.size), r.method, r.setting, f"{r.median_ms:.3g}", f"{r.p90_ms:.3g}", f"{r.error:.1e}",
+                 f"{r.residual:.1e}", r.status)
+                for r in rows
+            ],
+        )  # fmt: skip
+    for path in written:
+        typer.echo(f"written: {path}", err=True)
+
+
+def _machine() -> dict[str, Any]:
+    from trainer.bench.machine import machine
+    from trainer.cli.practice import versions
+
+    return {**machine(), "versions": versions()}
