@@ -108,8 +108,8 @@ def equilibrate(world: World, before: Rigid, start_s: float, span_s: float, tool
     _judge_needle(world, held, force, end_s)
     _judge_jaws(world, held, force, end_s)
     world.tension_mN = float(np.max(found.tension, initial=0.0))
-    for (first, last, _), tension in zip(taut, found.tension, strict=True):
-        _judge_thread(world, rows, first, last, float(tension), end_s)
+    for (first, last, cable), tension in zip(taut, found.tension, strict=True):
+        _judge_thread(world, rows, first, last, cable, float(tension), end_s)
     _limits(world, held, force, end_s)
 
 
@@ -149,7 +149,7 @@ def _judge_jaws(world: World, held: Grips, force: Array, time_s: float) -> None:
 
 
 def _judge_thread(
-    world: World, rows: thread_pull.Constraints, first: int, last: int, tension: float, time_s: float
+    world: World, rows: thread_pull.Constraints, first: int, last: int, cable: Cable, tension: float, time_s: float
 ) -> None:
     """A taut thread slips from the weaker of its grips, breaks, or cuts through the wall: whichever comes first."""
     spec = world.task.scene.thread
@@ -168,9 +168,12 @@ def _judge_thread(
     for row in range(first + 1, last):
         hole = rows.hole[row]
         if hole is not None:
-            ways = [rows.position[row + d] - rows.position[row] for d in (-1, 1)]
-            sizes = [float(np.linalg.norm(w)) for w in ways]
-            pull = sum((tension * w / s for w, s in zip(ways, sizes, strict=True) if s > 0.0), np.zeros(3))
+            pull = np.zeros(3)
+            for k, inside in ((row - 1, cable.channel[row - 1 - first]), (row + 1, cable.channel[row - first])):
+                way = rows.position[k] - rows.position[row]
+                size = float(np.linalg.norm(way))
+                if not inside and size > 0.0:
+                    pull += tension * way / size
             _tear(world, hole, float(np.linalg.norm(pull)), time_s)
 
 

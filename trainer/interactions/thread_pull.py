@@ -7,6 +7,7 @@ together: a taut cable in the tissue's equilibrium, whose tension slips a grip o
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -78,9 +79,19 @@ def cables(held: Constraints) -> list[tuple[int, int, Cable]]:
     for first, last in zip(hard[:-1], hard[1:], strict=True):
         rows = range(int(first), int(last) + 1)
         if len(rows) > 2:
-            slots = np.array([h.slot if (h := held.hole[r]) is not None else -1 for r in rows], dtype=np.int64)
-            length = float(held.arc[last] - held.arc[first])
-            found.append((int(first), int(last), Cable(slots, held.position[rows.start : rows.stop], length)))
+            holes = [held.hole[r] for r in rows]
+            # In the channel between the two holes of one wall the thread is as long as the channel is now.
+            channel = np.array(
+                [
+                    a is not None and b is not None and a.pass_number == b.pass_number and a.place.vessel == b.place.vessel
+                    for a, b in itertools.pairwise([*holes, None])
+                ]
+            )
+            place = held.position[rows.start : rows.stop]
+            inside = float(np.sum(np.linalg.norm(np.diff(place, axis=0), axis=1)[channel[:-1]]))
+            slots = np.array([h.slot if h is not None else -1 for h in holes], dtype=np.int64)
+            length = float(held.arc[last] - held.arc[first]) - inside
+            found.append((int(first), int(last), Cable(slots, place, length, channel)))
     return found
 
 

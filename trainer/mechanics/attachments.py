@@ -33,11 +33,16 @@ class Anchors:
 
 @dataclass(frozen=True)
 class Cable:
-    """A thread without friction through k points: it pulls, and never pushes, so that its path is not too long."""
+    """A thread without friction through k points: it pulls, and never pushes, so that its path is not too long.
+
+    Where it runs in a channel, between two holes of one wall, it does not draw them together: the tissue between them
+    hardly gives way, which the few links of a thin wall do not show. Such a stretch is no part of path and length.
+    """
 
     slot: np.ndarray  # (k,) int; -1 for a point that is no material point
     place: Array  # (k, 3) mm, where that point is; not read elsewhere
-    length_mm: float
+    length_mm: float  # of the thread outside channels
+    channel: np.ndarray  # (k,) bool; True where the way on to the next point is a channel
 
 
 @dataclass(frozen=True)
@@ -63,6 +68,7 @@ class Rows:
     cable_start: np.ndarray  # (c + 1,) a cable's points in the next two
     cable_at: np.ndarray  # (k,) -1 for a place in the world
     cable_place: Array  # (k, 3) mm
+    channel: np.ndarray  # (k,) bool
     length: Array  # (c,) mm; changed while lengths are approached in steps
     load: Array  # (u, 3) mN
 
@@ -95,6 +101,7 @@ def flatten(anchors: Anchors, cables: tuple[Cable, ...], loads: Loads) -> Rows:
         cable_start=np.concatenate([[0], np.cumsum([len(c.slot) for c in cables])]).astype(np.int64),
         cable_at=np.where(cable_slot < 0, -1, np.searchsorted(slots, cable_slot)).astype(np.int64),
         cable_place=np.ascontiguousarray(cable_place),
+        channel=np.concatenate([np.zeros(0, dtype=np.bool_), *(c.channel for c in cables)]).astype(np.bool_),
         length=length,
         load=load,
     )
@@ -109,6 +116,7 @@ def pull(
     cable_start: np.ndarray,
     cable_at: np.ndarray,
     cable_place: Array,
+    channel: np.ndarray,
     length: Array,
     multiplier: Array,
     penalty: Array,
@@ -148,6 +156,8 @@ def pull(
         for k in range(first, last):
             row[k, 0] = row[k, 1] = row[k, 2] = 0.0
         for k in range(first, last - 1):
+            if channel[k]:
+                continue
             i, j = cable_at[k], cable_at[k + 1]
             d0 = (p[j, 0] if j >= 0 else cable_place[k + 1, 0]) - (p[i, 0] if i >= 0 else cable_place[k, 0])
             d1 = (p[j, 1] if j >= 0 else cable_place[k + 1, 1]) - (p[i, 1] if i >= 0 else cable_place[k, 1])
@@ -179,6 +189,8 @@ def pull(
                         for c in range(3):
                             matrix[3 * i + r, 3 * j + c] += penalty[n] * row[k, r] * row[m, c]
         for k in range(first, last - 1):
+            if channel[k]:
+                continue
             i, j = cable_at[k], cable_at[k + 1]
             d0 = (p[j, 0] if j >= 0 else cable_place[k + 1, 0]) - (p[i, 0] if i >= 0 else cable_place[k, 0])
             d1 = (p[j, 1] if j >= 0 else cable_place[k + 1, 1]) - (p[i, 1] if i >= 0 else cable_place[k, 1])

@@ -1,9 +1,8 @@
 """Cholesky factor of a banded stiffness matrix, kept for many solves.
 
 A matrix whose entries lie within b of the diagonal needs n b² / 2 multiplications to factor and 2 n b to solve
-(Golub and Van Loan, Matrix Computations, section 4.3). The factor is kept twice, by columns and by rows: both
-substitutions then subtract multiples of contiguous stretches, which the compiler turns into vector instructions
-without being allowed to reorder a sum, so that results are the same bits in every run.
+(Golub and Van Loan, Matrix Computations, section 4.3). The factor is kept by columns, and both substitutions take the
+three columns of a node at once: forwards they subtract multiples of contiguous stretches, backwards they sum products.
 
 A solve is bound by the memory that it reads. The factor is computed in double precision and kept in single, which
 halves that memory; the arithmetic is double. So a solve is that of a matrix which differs from K by 1e-7 of its
@@ -29,7 +28,6 @@ class BandedFactor:
 
     order: np.ndarray  # (f,) int32 nodes, in the order of elimination
     columns: np.ndarray  # (3 f, b) float32, L[j + 1 + k, j]
-    rows: np.ndarray  # (3 f, b) float32, L[j, j - b + k]
     inverse: Array  # (3 f,) 1 / D[j]
 
 
@@ -58,7 +56,6 @@ def factor_band(
     band: Array,
     diagonal: Array,
     columns: np.ndarray,
-    rows: np.ndarray,
     inverse: Array,
     first: int,
     last: int,
@@ -66,7 +63,7 @@ def factor_band(
 ) -> int:
     """L D Lᵀ of ``band`` (overwritten), L with unit diagonal: the columns ``first`` … ``last`` - 1, given those before.
 
-    ``columns[j, k]`` is L[j + 1 + k, j], ``rows[j, k]`` is L[j, j - b + k], ``inverse[j]`` is 1 / D[j]. A pivot that
+    ``columns[j, k]`` is L[j + 1 + k, j], ``inverse[j]`` is 1 / D[j]. A pivot that
     is below the share ``least`` of ``diagonal`` (3 f,), the band's own before, is replaced by it, so that the rest
     stays finite. Returns how often that was done: unless it is 0, the factor is that of another matrix.
     """
@@ -83,7 +80,6 @@ def factor_band(
         for k in range(1, reach + 1):
             multiplier = band[j, k] * inverse[j]
             columns[j, k - 1] = multiplier
-            rows[j + k, b - k] = multiplier
             source = band[j, k : reach + 1]
             target = band[j + k, : reach + 1 - k]
             for m in range(len(source)):
@@ -92,25 +88,53 @@ def factor_band(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def solve_band(columns: np.ndarray, rows: np.ndarray, inverse: Array, v: Array) -> None:
-    """Overwrites ``v`` (3 f,) with K⁻¹ v."""
+def substitute_forwards(columns: np.ndarray, inverse: Array, v: Array) -> None:
+    """Overwrites ``v`` (3 f,) with D⁻¹ L⁻¹ v."""
     n, b = columns.shape
-    for j in range(n):
-        a = v[j]
-        reach = min(b, n - 1 - j)
-        column = columns[j, :reach]
-        target = v[j + 1 : j + 1 + reach]
+    for j in range(0, n, 3):
+        a0 = v[j]
+        v[j + 1] -= a0 * columns[j, 0]
+        a1 = v[j + 1]
+        v[j + 2] -= a0 * columns[j, 1] + a1 * columns[j + 1, 0]
+        a2 = v[j + 2]
+        below = n - 3 - j
+        reach = min(b - 2, below)
+        c0, c1, c2 = columns[j, 2 : 2 + reach], columns[j + 1, 1 : 1 + reach], columns[j + 2, :reach]
+        target = v[j + 3 : j + 3 + reach]
         for k in range(reach):
-            target[k] -= a * column[k]
+            target[k] -= a0 * c0[k] + a1 * c1[k] + a2 * c2[k]
+        if reach < below:  # the second and third columns reach one and two rows further
+            v[j + 3 + reach] -= a1 * columns[j + 1, 1 + reach] + a2 * columns[j + 2, reach]
+        if reach + 1 < below:
+            v[j + 4 + reach] -= a2 * columns[j + 2, 1 + reach]
     for j in range(n):
         v[j] *= inverse[j]
-    for j in range(n - 1, -1, -1):
-        a = v[j]
-        reach = min(b, j)
-        row = rows[j, b - reach :]
-        target = v[j - reach : j]
+
+
+# The one kernel whose sums the compiler may reorder: they do not vectorise otherwise, and the factor would have to be
+# kept by rows as well. The order is fixed when it is compiled, so results are still the same bits in every run.
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc"})
+def substitute_backwards(columns: np.ndarray, v: Array) -> None:
+    """Overwrites ``v`` (3 f,) with L⁻ᵀ v."""
+    n, b = columns.shape
+    for j in range(n - 3, -1, -3):
+        below = n - 3 - j
+        reach = min(b - 2, below)
+        c0, c1, c2 = columns[j, 2 : 2 + reach], columns[j + 1, 1 : 1 + reach], columns[j + 2, :reach]
+        known = v[j + 3 : j + 3 + reach]
+        s0, s1, s2 = 0.0, 0.0, 0.0
         for k in range(reach):
-            target[k] -= a * row[k]
+            s0 += c0[k] * known[k]
+            s1 += c1[k] * known[k]
+            s2 += c2[k] * known[k]
+        if reach < below:
+            s1 += columns[j + 1, 1 + reach] * v[j + 3 + reach]
+            s2 += columns[j + 2, reach] * v[j + 3 + reach]
+        if reach + 1 < below:
+            s2 += columns[j + 2, 1 + reach] * v[j + 4 + reach]
+        v[j + 2] -= s2
+        v[j + 1] -= s1 + columns[j + 1, 0] * v[j + 2]
+        v[j] -= s0 + columns[j, 0] * v[j + 1] + columns[j, 1] * v[j + 2]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -144,8 +168,8 @@ class Factoring:
         self._band = np.zeros((size, b + 1))
         assemble_band(blocks, links, place, self._band)
         self._diagonal = self._band[:, 0].copy()
-        columns, rows = np.zeros((2, size, b), dtype=np.float32)
-        self.factor = BandedFactor(np.ascontiguousarray(order, dtype=np.int32), columns, rows, np.zeros(size))
+        columns = np.zeros((size, b), dtype=np.float32)
+        self.factor = BandedFactor(np.ascontiguousarray(order, dtype=np.int32), columns, np.zeros(size))
         self._next = 0
         self.replaced = 0  # pivots that were too small: the factor is of no use
 
@@ -153,7 +177,7 @@ class Factoring:
         """Eliminates ``count`` more unknowns; True when ``factor`` is complete. ``least``: see factor_band."""
         f = self.factor
         last = min(self._next + count, len(f.inverse))
-        self.replaced += factor_band(self._band, self._diagonal, f.columns, f.rows, f.inverse, self._next, last, least)
+        self.replaced += factor_band(self._band, self._diagonal, f.columns, f.inverse, self._next, last, least)
         self._next = last
         return last == len(f.inverse)
 
@@ -175,5 +199,6 @@ def solve(kept: BandedFactor, values: Array, out: Array) -> None:
     """K⁻¹ of the forces ``values`` (n, 3) mN on the factor's nodes into the same rows of ``out`` (n, 3) mm."""
     v = np.empty(len(kept.inverse))
     gather(values, kept.order, v)
-    solve_band(kept.columns, kept.rows, kept.inverse, v)
+    substitute_forwards(kept.columns, kept.inverse, v)
+    substitute_backwards(kept.columns, v)
     scatter(v, kept.order, out)

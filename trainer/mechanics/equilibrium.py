@@ -226,6 +226,7 @@ class Equilibrium:
             rows.cable_start,
             rows.cable_at,
             rows.cable_place,
+            rows.channel,
             rows.length,
             work.multiplier,
             work.penalty,
