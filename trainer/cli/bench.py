@@ -73,7 +73,7 @@ def realtime(
 
 @app.command("speed-error")
 def speed_error(
-    quick: Annotated[bool, typer.Option("--quick", help="Below a minute: without the longest relaxation.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Below a minute: without the longest relaxations.")] = False,
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Where the report goes; by default reports/ if it is here.")
     ] = None,
