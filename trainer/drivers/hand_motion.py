@@ -64,9 +64,7 @@ def needle_pose(point: Array, tangent: Array, inward: Array, arc: float, radius:
     in_needle = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])  # columns: tangent, inward, normal
     in_world = np.stack([tangent, inward, cross(tangent, inward)], axis=-1)
     rotation = in_world @ in_needle.T
-    return Rigid(
-        point - rotation @ np.array([-radius * s, radius * (1.0 - c), 0.0]), quaternion_from_matrix(rotation)
-    )
+    return Rigid(point - rotation @ np.array([-radius * s, radius * (1.0 - c), 0.0]), quaternion_from_matrix(rotation))
 
 
 def along_arc(pose: Rigid, distance: float, radius: float) -> Rigid:

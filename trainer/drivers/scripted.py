@@ -32,6 +32,7 @@ CLEAR_PAST_MM = 0.06  # distance at which the needle passes the other end of the
 BITE_DEPTH_MM = 2.0  # arc beyond a hole at which the other hand takes over
 TAKE_AT_MM = 0.6  # distance from the tip at which the other hand takes the needle
 RISE = 0.4  # how steeply the thread is pulled away from the vessels
+TRIES = 5  # at catching needle or thread
 JAW_S = 0.15  # time to open or close the jaws
 TURN = 2.0  # fastest turn of an instrument, rad/s (assumed)
 
@@ -247,15 +248,14 @@ class ScriptedHands:
         tool = 1 - self._holder()
         link = self._task.scene.thread.link_mm if self._task.scene.thread else 1.0
         node = len(thread) - 1 - max(1, round(0.3 * self._view.tail_mm / link))
-        yield from self._jaws(tool, 0.0)
-        point = thread[node]
-        reach = Rigid(point, self._pose[tool].quaternion)
-        back = Rigid(point - STAND_OFF_MM * reach.matrix()[:, 0], reach.quaternion)
-        yield from self._glide(tool, back)
-        yield from self._glide(tool, Rigid(thread[node], reach.quaternion), 0.5)
-        yield from self._jaws(tool, 1.0)
-        if tool not in self._view.thread_holders:
-            raise _Lost("the thread was not caught")
+        turned = self._pose[tool].quaternion
+
+        def place() -> Rigid:
+            nodes = self._view.thread
+            assert nodes is not None
+            return Rigid(nodes[node], turned)
+
+        yield from self._catch(tool, place, lambda: tool in self._view.thread_holders)
         first = next(s.vessel for s in self._task.step if s.kind == "drive")
         direction = self._across(first)
         pulled = 0.0
@@ -276,16 +276,26 @@ class ScriptedHands:
         needle_spec = self._task.scene.needle
         assert needle_spec is not None
         arc = needle_spec.held_at * self._needle_length if at_mm is None else at_mm
-        yield from self._jaws(taking, 0.0)
-        grip = self._grip(self._needle(), arc)
-        yield from self._glide(taking, Rigid(grip.position - STAND_OFF_MM * grip.matrix()[:, 0], grip.quaternion))
-        yield from self._glide(taking, self._grip(self._needle(), arc), 0.5)
-        yield from self._jaws(taking, 1.0)
-        if taking not in self._view.needle_holders:
-            raise _Lost("the needle was not caught")
+
+        def place() -> Rigid:
+            return self._grip(self._needle(), arc)
+
+        yield from self._catch(taking, place, lambda: taking in self._view.needle_holders)
         yield from self._jaws(giving, 0.0)
         here = self._pose[giving]
         yield from self._glide(giving, Rigid(here.position - 2.0 * here.matrix()[:, 0], here.quaternion))
+
+    def _catch(self, tool: int, place: Callable[[], Rigid], caught: Callable[[], bool]) -> Movement:
+        """Open, reach for ``place`` and close; look, and try again."""
+        for _ in range(TRIES):
+            yield from self._jaws(tool, 0.0)
+            seen = place()
+            yield from self._glide(tool, Rigid(seen.position - STAND_OFF_MM * seen.matrix()[:, 0], seen.quaternion))
+            yield from self._glide(tool, place(), 0.5)
+            yield from self._jaws(tool, 1.0)
+            if caught():
+                return
+        raise _Lost("the jaws do not catch it")
 
     def _grip(self, needle: Rigid, arc: float) -> Rigid:
         """Where an instrument holds the needle at ``arc``: jaws pointing at the circle's centre, across the wire."""
@@ -486,5 +496,3 @@ def _steepest_from_lumen(bite: float, aside: float, radius: float, wall: float, 
         if math.hypot(radius - depth, run * math.sin(aside)) <= 0.9 * lumen:
             return float(degrees)
     return 20.0
-
-

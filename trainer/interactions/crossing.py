@@ -21,9 +21,7 @@ def _side(px, py, pz, ax, ay, az, bx, by, bz, cx, cy, cz):  # type: ignore[no-un
     """Six times the signed volume of (a, b, c, p): positive where p is on the side of the normal."""
     ux, uy, uz = bx - ax, by - ay, bz - az
     vx, vy, vz = cx - ax, cy - ay, cz - az
-    return (
-        (uy * vz - uz * vy) * (px - ax) + (uz * vx - ux * vz) * (py - ay) + (ux * vy - uy * vx) * (pz - az)
-    )
+    return (uy * vz - uz * vy) * (px - ax) + (uz * vx - ux * vz) * (py - ay) + (ux * vy - uy * vx) * (pz - az)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from trainer.curriculum import InstrumentSpec
@@ -16,8 +18,8 @@ from trainer.interactions.world import Jaw, World, vector
 
 #: Area of one jaw's tip on tissue, mm²: 0.1 mm wide and 0.3 mm deep (assumed).
 PAD_MM2 = 0.03
-#: A second instrument on the needle loses it when the needle moves this far from its jaws, mm (assumed).
-WRENCH_MM = 0.2
+#: A second instrument on the needle loses it when the two drift apart by this much, mm (assumed: tips flex).
+WRENCH_MM = 0.5
 
 
 def close_and_open(world: World, closures: Array, time_s: float) -> None:
@@ -90,10 +92,10 @@ def second_grips(world: World, time_s: float) -> None:
     """The needle follows the instrument that leads it; another one loses it when they drift apart."""
     leader = world.needle_tool()
     for i, jaw in enumerate(world.jaws):
-        if jaw.target == "needle" and i != leader and world.needle is not None:
-            distance, _ = needle_closest(world.needle, world.needle_pose.inverse().apply(jaw.pose.position))
-            if distance > WRENCH_MM:
-                slip(world, i, 0.0, capacity_mN(world, i), time_s)
+        if jaw.target == "needle" and i != leader and jaw.tool_from_needle is not None:
+            meant = world.needle_pose @ jaw.tool_from_needle.inverse()
+            if math.dist(meant.position, jaw.pose.position) > WRENCH_MM:
+                slip(world, i, capacity_mN(world, i), capacity_mN(world, i), time_s)
 
 
 def _catch(world: World, tool: int, jaw: Jaw, spec: InstrumentSpec, time_s: float) -> None:
@@ -151,4 +153,3 @@ def _dropped(world: World, target: str, time_s: float, tool: str) -> None:
 
 def _body(world: World, jaw: Jaw) -> str:
     return world.tissue.vessels[jaw.vessel].spec.name if world.tissue is not None and jaw.vessel >= 0 else ""
-

@@ -14,7 +14,7 @@ import numpy as np
 from trainer.anatomy.vessel import material_coordinates, ring
 from trainer.curriculum import VesselSpec
 from trainer.events import Contact, Pierce, PullThrough, Withdraw
-from trainer.geometry import Array, Rigid, unit
+from trainer.geometry import Array, Rigid, cross, unit
 from trainer.instruments.needle import needle_closest, needle_point, needle_tangent
 from trainer.interactions.crossing import first_crossing, nearest_on_surface
 from trainer.interactions.world import Hole, Place, TipContact, World, vector
@@ -69,9 +69,7 @@ def glide(world: World) -> None:
     contact.slot = world.solver.hold(contact.place.nodes, contact.place.weights)
 
 
-def puncture(
-    world: World, before: Rigid, after: Rigid, force: Array, start_s: float, span_s: float, tool: str
-) -> None:
+def puncture(world: World, before: Rigid, after: Rigid, force: Array, start_s: float, span_s: float, tool: str) -> None:
     """Judge the contact by the ``force`` (3,) mN of the tip on the wall at the end of a movement.
 
     The contact ends when the wall pulls the tip back; it becomes a hole when the wall gives way.
@@ -80,13 +78,12 @@ def puncture(
     if contact is None or world.tissue is None or world.solver is None:
         return
     normal, surface = world.undented(contact.place)
-    pressing = -normal if contact.inwards else normal
     tangent = after.rotate(np.array([1.0, 0.0, 0.0]))
     world.touched[contact.place.vessel, contact.place.wall] = start_s + span_s
-    if force @ pressing < 0.0:
+    if _side(world, contact.place) * (1.0 if contact.inwards else -1.0) > 0.0:
+        # The wall pulls at the tip: it is back on the side that it came from, as the wall lies now.
         world.solver.drop(contact.slot)
         world.contact = None
-        # The tip is back on the side it came from, but only as the wall lies now.
         world.before = world.solver.x.copy()
         return
     along, limit = float(force @ tangent), _puncture_mN(world, contact.place)
@@ -127,8 +124,7 @@ def follow_needle(world: World, time_s: float, tool: str) -> None:
             continue
         at = world.needle_pose.inverse().apply(world.point(hole.place))
         arc = _arc_through(world, at)
-        was = hole.arc
-        hole.slid_mm, hole.arc = arc - was, arc
+        hole.slid_mm, hole.arc = arc - hole.arc, arc
         hole.along = world.needle_pose.rotate(needle_tangent(world.needle, min(max(arc, 0.0), length)))
         # The outer wall's normal serves both walls: it is the way through.
         normal, _ = world.undented(hole.place)
@@ -138,8 +134,9 @@ def follow_needle(world: World, time_s: float, tool: str) -> None:
             "body": world.vessel_name(hole.place), "wall": hole.place.wall, "hole": hole.number,
             "pass_number": hole.pass_number, "reached_mm": hole.reached_mm,
         }  # fmt: skip
-        if arc < 0.0 and was < 0.0:  # a movement later, when the tip's way out is behind what ``detect`` looks at
+        if arc < 0.0 and _side(world, hole.place) * (1.0 if hole.inwards else -1.0) > 0.0:
             close(world, hole)
+            world.before = world.solver.x.copy()  # out of the hole as the wall lies now
             world.emit(Withdraw, time_s, tool, end="tip", **shared)
         elif arc > length:
             world.emit(PullThrough, time_s, tool, **shared)
@@ -177,6 +174,13 @@ def _arc_through(world: World, at: Array) -> float:
         return arc
     end = at - needle_point(world.needle, world.needle.length)
     return world.needle.length + max(0.0, -float(end @ needle_tangent(world.needle, world.needle.length)))
+
+
+def _side(world: World, place: Place) -> float:
+    """Positive where the needle's tip lies outwards of the triangle of ``place``, as the next crossing will judge it."""
+    assert world.solver is not None
+    a, b, c = world.solver.x[place.nodes]
+    return float((world.needle_pose.position - a) @ cross(b - a, c - a))
 
 
 def _needle_length(world: World) -> float:

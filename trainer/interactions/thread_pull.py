@@ -83,7 +83,10 @@ def cables(held: Constraints) -> list[tuple[int, int, Cable]]:
             # In the channel between the two holes of one wall the thread is as long as the channel is now.
             channel = np.array(
                 [
-                    a is not None and b is not None and a.pass_number == b.pass_number and a.place.vessel == b.place.vessel
+                    a is not None
+                    and b is not None
+                    and a.pass_number == b.pass_number
+                    and a.place.vessel == b.place.vessel
                     for a, b in itertools.pairwise([*holes, None])
                 ]
             )
