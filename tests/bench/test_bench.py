@@ -87,7 +87,14 @@ def rows() -> list[Row]:
     ]
 
 
-ABOUT = {"cpu": "a <processor>", "cores": 2, "system": "Linux x86_64", "versions": {"numpy": "2.4"}}
+ABOUT = {
+    "cpu": "a <processor>",
+    "cores": 2,
+    "system": "Linux x86_64",
+    "load_before": 0.5,
+    "load_after": 1.5,
+    "versions": {"numpy": "2.4"},
+}
 
 
 def test_the_report_holds_every_row_and_says_on_what_it_was_made(tmp_path: Path) -> None:
@@ -100,7 +107,7 @@ def test_the_report_holds_every_row_and_says_on_what_it_was_made(tmp_path: Path)
     words = (folder / "speed_error.md").read_text()
     assert sum(line.startswith(("| tracking |", "| cold |")) for line in words.splitlines()) == len(rows())
     assert "--quick" in words
-    assert "a <processor>, 2 cores" in words
+    assert "a <processor>, 2 cores, Linux x86_64; load 0.5 before and 1.5 after; numpy 2.4" in words
     drawn = ElementTree.fromstring((folder / "speed_error.svg").read_text())
     assert sum(e.tag.endswith("circle") for e in drawn.iter()) == len(rows())
 
@@ -145,7 +152,7 @@ def test_a_task_in_real_time(command_line: CommandLine, own_log: Path) -> None:
     assert found["task"] == "anastomosis/needle-drive"
     assert (found["ticks"], found["tick_hz"], found["sessions"]) == (21, 100.0, ["cut short"])
     assert 0.0 < found["p50_ms"] <= found["p99_ms"] <= found["max_ms"]
-    assert {"cpu", "cores", "system", "versions"} <= set(found["machine"])
+    assert {"cpu", "cores", "system", "load_before", "load_after", "versions"} == set(found["machine"])
     assert not own_log.exists()
 
 

@@ -9,26 +9,26 @@ from typing import Any
 
 
 def machine() -> dict[str, Any]:
-    """Processor, cores that this process may use, system, and the load (mean of running processes) of the last minute.
-
-    What the system does not tell is "unknown" or absent.
-    """
-    found: dict[str, Any] = {
+    """Processor, cores that this process may use, system, and the load now, before the measurement."""
+    return {
         "cpu": _cpu(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "system": f"{platform.system()} {platform.machine()}",
+        "load_before": load(),
     }
-    if hasattr(os, "getloadavg"):
-        found["load_before"] = round(os.getloadavg()[0], 2)
-    return found
+
+
+def load() -> float | None:
+    """Mean number of running processes in the last minute, this one included; None where the system has no such."""
+    return round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None
 
 
 def in_words(about: dict[str, Any]) -> str:
-    """One line of :func:`machine` and, where it has them, versions."""
+    """One line of :func:`machine` with ``load_after`` the measurement and ``versions`` by name."""
     words = [f"{about['cpu']}, {about['cores']} cores, {about['system']}"]
-    if "load_before" in about:
-        words.append(f"load before the run {about['load_before']}")
-    words += [f"{name} {version}" for name, version in about.get("versions", {}).items()]
+    if about["load_before"] is not None:
+        words.append(f"load {about['load_before']} before and {about['load_after']} after")
+    words += [f"{name} {version}" for name, version in about["versions"].items() if name != "machine"]
     return "; ".join(words)
 
 

@@ -24,7 +24,7 @@ def document(rows: Sequence[Row], order: dict[int, float], about: dict[str, Any]
     return {
         "quick": quick,
         "machine": about,
-        "relaxation_order_ms": {str(size): ms for size, ms in order.items()},
+        "relaxation_order_ms": {str(size): took for size, took in order.items()},
         "rows": [asdict(row) for row in rows],
     }
 
@@ -43,7 +43,7 @@ def write(folder: Path, rows: Sequence[Row], order: dict[int, float], about: dic
 
 
 def markdown(rows: Sequence[Row], order: dict[int, float], about: dict[str, Any], quick: bool) -> str:
-    spent = ", ".join(f"{ms:.1f} ms at {size} nodes" for size, ms in order.items())
+    spent = ", ".join(f"{took:.1f} ms at {size} nodes" for size, took in order.items())
     lines = [
         "# Time against error: a vessel's equilibrium",
         "",
@@ -76,10 +76,15 @@ def markdown(rows: Sequence[Row], order: dict[int, float], about: dict[str, Any]
     ]
     for r in rows:
         lines.append(
-            f"| {r.case} | {r.size} | {r.method} | {r.setting} | {r.median_ms:.3g} | {r.p90_ms:.3g} "
+            f"| {r.case} | {r.size} | {r.method} | {r.setting} | {ms(r.median_ms)} | {ms(r.p90_ms)} "
             f"| {r.error:.1e} | {r.residual:.1e} | {r.status} |"
         )
     return "\n".join([*lines, ""])
+
+
+def ms(value: float) -> str:
+    """A time to three digits, without an exponent."""
+    return f"{value:.0f}" if value >= 100.0 else f"{value:.3g}"
 
 
 def comparison(rows: Sequence[Row]) -> list[str]:
@@ -91,10 +96,10 @@ def comparison(rows: Sequence[Row]) -> list[str]:
             tried = [r for r in rows if (r.case, r.size, r.method) == (case, size, method)]
             enough = [r.median_ms for r in tried if r.error <= COMPARED_AT]
             if enough:
-                words.append(f"{method} {min(enough):.3g} ms")
+                words.append(f"{method} {ms(min(enough))} ms")
             else:
                 best = min(tried, key=lambda r: r.error)
-                words.append(f"{method} none (best error {best.error:.1e} in {best.median_ms:.3g} ms)")
+                words.append(f"{method} none (best error {best.error:.1e} in {ms(best.median_ms)} ms)")
         said.append(f"* {case}, {size} nodes: {'; '.join(words)}.")
     return said
 
@@ -126,8 +131,8 @@ def _decades(values: Sequence[float]) -> tuple[int, int]:
 def _panel(x0: float, y0: float, case: str, rows: list[Row], across: tuple[int, int], up: tuple[int, int]) -> list[str]:
     left, right, top, bottom = x0 + LEFT, x0 + WIDTH - RIGHT, y0 + TOP, y0 + HEIGHT - BOTTOM
 
-    def x(ms: float) -> float:
-        return left + (math.log10(ms) - across[0]) / (across[1] - across[0]) * (right - left)
+    def x(took: float) -> float:
+        return left + (math.log10(took) - across[0]) / (across[1] - across[0]) * (right - left)
 
     def y(error: float) -> float:
         return bottom - (math.log10(error) - up[0]) / (up[1] - up[0]) * (bottom - top)

@@ -36,7 +36,7 @@ def realtime(
     from contextlib import ExitStack
     from tempfile import TemporaryDirectory
 
-    from trainer.bench.machine import in_words
+    from trainer.bench.machine import in_words, load
     from trainer.bench.realtime import measure
     from trainer.cli.practice import perform
     from trainer.curriculum import load_task
@@ -56,6 +56,7 @@ def realtime(
             return str(done["outcome"])
 
         found = measure(session, task_file.task.tick_hz, seconds)
+    about["load_after"] = load()
     nodes = sum(2 * vessel.layers * vessel.around for vessel in task_file.task.scene.vessel)
     result = {"task": task_file.path, "nodes": nodes, **found, "machine": about}
     if as_json:
@@ -81,6 +82,7 @@ def speed_error(
 ) -> None:
     """Time against error of the ways to a vessel's equilibrium; writes speed_error.md, .svg and .json."""
     from trainer.bench import page
+    from trainer.bench.machine import load
     from trainer.bench.speed_error import measure
     from trainer.cli.sessions import print_table
     from trainer.cli.warmup import announce
@@ -89,6 +91,7 @@ def speed_error(
     announce()
     about = _machine()
     rows, order = measure(quick)
+    about["load_after"] = load()
     written = page.write(folder, rows, order, about, quick)
     if as_json:
         print(json.dumps(page.document(rows, order, about, quick), indent=2, allow_nan=False))
@@ -96,7 +99,7 @@ def speed_error(
         print_table(
             ("case", "nodes", "method", "setting", "median ms", "p90 ms", "error / R", "residual mN", "status"),
             [
-                (r.case, str(r.size), r.method, r.setting, f"{r.median_ms:.3g}", f"{r.p90_ms:.3g}", f"{r.error:.1e}",
+                (r.case, str(r.size), r.method, r.setting, page.ms(r.median_ms), page.ms(r.p90_ms), f"{r.error:.1e}",
                  f"{r.residual:.1e}", r.status)
                 for r in rows
             ],
