@@ -10,6 +10,7 @@ from trainer import scene
 from trainer.curriculum import Task, load_task
 from trainer.drivers.scripted import ScriptedHands
 from trainer.events import Event, Pierce, TaskDone
+from trainer.log.record import SessionHeader, SessionRecord
 from trainer.poses import ToolPoses
 from trainer.profile import Hand
 
@@ -52,3 +53,25 @@ def one_drive() -> Task:
     """The first drive of ``needle-drive`` alone: through both walls once."""
     task = load_task("anastomosis/needle-drive").task
     return replace(task, step=task.step[:1])
+
+
+def record_of(done: Performance, task: Task, device: str = "scripted") -> SessionRecord:
+    """What the log would hold of a performance."""
+    header = SessionHeader(
+        id="in-memory", trainee="nobody", task=task.name, task_toml="", task_sha256="", device=device, device_toml="",
+        device_sha256="", seed=0, tick_hz=task.tick_hz, tools=done.scene.tools, started_at="2026-01-01T00:00:00Z",
+        versions={}, recording=None,
+    )  # fmt: skip
+    return SessionRecord(
+        header=header,
+        status="ended",
+        outcome=done.done.outcome,
+        ticks=done.scene.tick,
+        duration_s=done.scene.tick / task.tick_hz,
+        events=done.events,
+        first_tick=0,
+        position=np.array([p.position for p in done.poses]),
+        quaternion=np.array([p.quaternion for p in done.poses]),
+        closure=np.array([p.closure for p in done.poses]),
+        valid=np.array([p.valid for p in done.poses]),
+    )

@@ -483,7 +483,7 @@ def _steepest_from_lumen(bite: float, aside: float, radius: float, wall: float, 
     """The steepest angle in degrees at which a needle inside a lumen can meet the wall at ``bite`` mm from its end.
 
     The shaft must leave by the open end without touching the opposite wall: where the circle of radius ``needle``
-    through the tip reaches the cut plane, it must lie within nine tenths of the lumen's radius.
+    through the tip reaches the cut plane, it must lie within three quarters of the lumen's radius.
     """
     lumen = radius - wall
     for degrees in range(90, 20, -1):
@@ -493,6 +493,6 @@ def _steepest_from_lumen(bite: float, aside: float, radius: float, wall: float, 
         if sine < -1.0:
             continue
         depth = wall + needle * (math.sqrt(1.0 - sine * sine) - math.cos(steep))
-        if math.hypot(radius - depth, run * math.sin(aside)) <= 0.9 * lumen:
+        if math.hypot(radius - depth, run * math.sin(aside)) <= 0.75 * lumen:
             return float(degrees)
     return 20.0

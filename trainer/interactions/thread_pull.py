@@ -104,6 +104,10 @@ def settle(world: World, time_s: float) -> None:
         return
     held = constraints(world)
     slid = slide(world.thread, held.arc, held.position, held.hard, world.pieces)
+    if np.any(slid.shortage > 0.0):
+        _creep(world, held, slid.shortage)
+        held = constraints(world)
+        slid = slide(world.thread, held.arc, held.position, held.hard, world.pieces)
     for row, hole in enumerate(held.hole):
         if hole is None:
             continue
@@ -116,7 +120,6 @@ def settle(world: World, time_s: float) -> None:
                 Withdraw, time_s, "", body=world.vessel_name(hole.place), wall=hole.place.wall, hole=hole.number,
                 pass_number=hole.pass_number, end="tail", reached_mm=hole.reached_mm,
             )  # fmt: skip
-    _creep(held, slid.shortage, world)
     lay(world)
 
 
@@ -140,13 +143,12 @@ def overdrawn(world: World) -> list[tuple[tuple[int, ...], float, float]]:
     return found
 
 
-def _creep(held: Constraints, shortage: Array, world: World) -> None:
+def _creep(world: World, held: Constraints, shortage: Array) -> None:
     """A taut thread creeps through a grip by what the tissue's equilibrium has left over: micrometres."""
-    for row, lack in enumerate(shortage):
-        if lack > 0.0:
-            last = next(r for r in range(row + 1, len(held.arc)) if held.hard[r])
-            if held.grip[last] >= 0:
-                world.jaws[held.grip[last]].arc += float(lack)
+    for row in np.flatnonzero(shortage > 0.0):
+        last = next(r for r in range(int(row) + 1, len(held.arc)) if held.hard[r])
+        if held.grip[last] >= 0:
+            world.jaws[held.grip[last]].arc += float(shortage[row])
 
 
 def lay(world: World) -> Constraints:
