@@ -55,9 +55,7 @@ def test_forty_sessions_hold_and_tell_expert_from_novice() -> None:
         print(f"{hand}: {sum(s['outcome'] == 'completed' for s in group)} of {SEEDS} completed")
     assert sum(s["outcome"] == "completed" for s in experts) >= 0.9 * SEEDS
     for name in ("entry_angle_error_deg", "bite_asymmetry", "path_length_right_mm"):
-        skilled, unskilled = (
-            [v for s in group if isinstance(v := s[name], float)] for group in (experts, novices)
-        )
+        skilled, unskilled = ([v for s in group if isinstance(v := s[name], float)] for group in (experts, novices))
         wrong = np.mean([a > b for a in skilled for b in unskilled])
         print(f"{name}: expert {median(skilled):.3g} (n={len(skilled)}), novice {median(unskilled):.3g} "
               f"(n={len(unskilled)}), wrong way round {wrong:.0%}")  # fmt: skip

@@ -23,17 +23,24 @@ WRENCH_MM = 0.5
 
 
 def close_and_open(world: World, closures: Array, time_s: float) -> None:
-    """Let the jaws go to ``closures`` (k,): rising through ``close_at`` grasps, falling below ``open_at`` releases."""
+    """Let the jaws go to ``closures`` (k,) and catch or release what they meet on the way.
+
+    Needle and thread are caught when the closure rises through ``close_at`` and released below ``open_at``; a wall as
+    long as the jaws are closer together than it is thick.
+    """
     for i, (jaw, spec) in enumerate(zip(world.jaws, world.task.scene.instrument, strict=True)):
-        closing = jaw.closure < spec.close_at <= closures[i]
-        jaw.closure = float(closures[i])
-        if jaw.target and jaw.closure < spec.open_at:
-            target, body = jaw.target, _body(world, jaw)
-            let_go(world, jaw)
-            world.emit(Release, time_s, world.tools[i], target=target, body=body)
-            _dropped(world, target, time_s, world.tools[i])
-        elif closing and not jaw.target:
+        before, jaw.closure = jaw.closure, float(closures[i])
+        if jaw.target:
+            if jaw.closure < spec.open_at or (jaw.target == "wall" and pressure_kPa(world, i) == 0.0):
+                target, body = jaw.target, _body(world, jaw)
+                let_go(world, jaw)
+                world.emit(Release, time_s, world.tools[i], target=target, body=body)
+                _dropped(world, target, time_s, world.tools[i])
+            continue
+        if before < spec.close_at <= jaw.closure:
             _catch(world, i, jaw, spec, time_s)
+        if before < jaw.closure and not jaw.target:
+            _catch_wall(world, i, jaw, spec, before, time_s)
 
 
 def slip(world: World, tool: int, load_mN: float, limit_mN: float, time_s: float) -> None:
@@ -99,7 +106,7 @@ def second_grips(world: World, time_s: float) -> None:
 
 
 def _catch(world: World, tool: int, jaw: Jaw, spec: InstrumentSpec, time_s: float) -> None:
-    """Grasp the needle, else the thread, else a wall: the first that lies within reach of the jaws' centre."""
+    """Grasp the needle, else the thread, where it lies within reach of the jaws' centre."""
     centre = jaw.pose.position
     if world.needle is not None:
         distance, arc = needle_closest(world.needle, world.needle_pose.inverse().apply(centre))
@@ -112,12 +119,14 @@ def _catch(world: World, tool: int, jaw: Jaw, spec: InstrumentSpec, time_s: floa
         if distance <= spec.reach_mm:
             jaw.target, jaw.arc = "thread", arc
             _grasped(world, tool, "", arc, capacity_mN(world, tool), time_s)
-            return
-    _catch_wall(world, tool, jaw, spec, time_s)
 
 
-def _catch_wall(world: World, tool: int, jaw: Jaw, spec: InstrumentSpec, time_s: float) -> None:
+def _catch_wall(world: World, tool: int, jaw: Jaw, spec: InstrumentSpec, before: float, time_s: float) -> None:
+    """Grasp the nearest wall within reach, if the jaws have just become narrower than it is thick."""
     if world.tissue is None or world.solver is None:
+        return
+    thick = [v.spec.wall_mm for v in world.tissue.vessels]
+    if not any(jaw_gap_mm(jaw.closure) < w <= jaw_gap_mm(before) for w in thick):
         return
     centre = jaw.pose.position
     found: tuple[float, int, str, int, Array] | None = None

@@ -99,7 +99,11 @@ def equilibrate(world: World, before: Rigid, start_s: float, span_s: float, tool
         taut = thread_pull.cables(rows)
     world.before = world.solver.x.copy()
     found = world.solver.solve(
-        held.anchors, tuple(c for _, _, c in taut), drag(world), tolerance_mN=TOLERANCE_MN, max_iterations=MOST_ITERATIONS
+        held.anchors,
+        tuple(c for _, _, c in taut),
+        drag(world),
+        tolerance_mN=TOLERANCE_MN,
+        max_iterations=MOST_ITERATIONS,
     )
     force = found.anchor_force
     tip = next((force[r] for r, who in enumerate(held.owner) if who is None), None)
@@ -133,7 +137,11 @@ def _judge_jaws(world: World, held: Grips, force: Array, time_s: float) -> None:
     for i, jaw in enumerate(world.jaws):
         if jaw.target != "wall":
             continue
-        load = float(np.linalg.norm(sum((force[r] for r, who in enumerate(held.owner) if who is not None and who == i), np.zeros(3))))
+        load = float(
+            np.linalg.norm(
+                sum((force[r] for r, who in enumerate(held.owner) if who is not None and who == i), np.zeros(3))
+            )
+        )
         assert world.tissue is not None
         tear = world.tissue.vessels[jaw.vessel].spec.tear_mN.value
         limit = grasp.capacity_mN(world, i)
@@ -183,7 +191,8 @@ def relieve(world: World, time_s: float) -> None:
         return
     spec = world.task.scene.thread
     assert spec is not None
-    for gripping, arc, _ in thread_pull.overdrawn(world):
+    while (found := thread_pull.overdrawn(world)) is not None:
+        gripping, arc = found
         weakest = min(gripping, key=lambda i: grasp.capacity_mN(world, i), default=None)
         limit = grasp.capacity_mN(world, weakest) if weakest is not None else math.inf
         if weakest is not None and limit <= spec.strength_mN.value:
@@ -230,8 +239,6 @@ def _check(world: World, name: str, value: float, tool: str, body: str, time_s: 
     key = f"{name} {tool}"
     if value > limit.value and key not in world.over:
         world.over.add(key)
-        world.emit(
-            Overforce, time_s, tool, body=body, quantity=name, value=value, limit=limit.value, unit=limit.unit
-        )
+        world.emit(Overforce, time_s, tool, body=body, quantity=name, value=value, limit=limit.value, unit=limit.unit)
     elif value < REARM * limit.value:
         world.over.discard(key)

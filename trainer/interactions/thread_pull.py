@@ -123,24 +123,23 @@ def settle(world: World, time_s: float) -> None:
     lay(world)
 
 
-def overdrawn(world: World) -> list[tuple[tuple[int, ...], float, float]]:
-    """Stretches of thread that two hard constraints pull further apart than thread and tissue allow.
+def overdrawn(world: World) -> tuple[tuple[int, ...], float] | None:
+    """A stretch of thread that two hard constraints pull further apart than thread and tissue allow, if there is one.
 
-    For each the instruments that hold it, the arc (mm) at which it would break, and how much thread lacks (mm).
+    The instruments that hold it, and the arc (mm) at which it would break.
     """
+    if world.thread is None:
+        return None
     held = constraints(world)
-    slid = slide(world.thread, held.arc, held.position, held.hard, world.pieces) if world.thread else None
-    found = []
-    hard = np.flatnonzero(held.hard)
-    for first, last in zip(hard[:-1], hard[1:], strict=True):
-        lack = float(slid.shortage[first]) if slid is not None else 0.0
-        if lack > CREEP_MM:
-            gripping = [g for g in (held.grip[first], held.grip[last]) if g >= 0]
-            leader = world.needle_tool()
-            if held.grip[first] < 0 and leader is not None:
-                gripping.append(leader)
-            found.append((tuple(gripping), 0.5 * float(held.arc[first] + held.arc[first + 1]), lack))
-    return found
+    slid = slide(world.thread, held.arc, held.position, held.hard, world.pieces)
+    for first in np.flatnonzero(slid.shortage > CREEP_MM):
+        last = next(r for r in range(int(first) + 1, len(held.arc)) if held.hard[r])
+        gripping = [g for g in (held.grip[first], held.grip[last]) if g >= 0]
+        leader = world.needle_tool()
+        if held.grip[first] < 0 and leader is not None:
+            gripping.append(leader)
+        return tuple(gripping), 0.5 * float(held.arc[first] + held.arc[first + 1])
+    return None
 
 
 def _creep(world: World, held: Constraints, shortage: Array) -> None:
@@ -151,14 +150,21 @@ def _creep(world: World, held: Constraints, shortage: Array) -> None:
             world.jaws[held.grip[last]].arc += float(shortage[row])
 
 
-def lay(world: World) -> Constraints:
+def lay(world: World) -> None:
     """Place the thread's nodes between the constraints; a needle that nothing holds trails behind."""
     assert world.thread is not None
     held = constraints(world)
-    follow(world.thread, world.nodes, held.arc, held.position, world.pieces)
-    if not needle_is_placed(world) and len(held.arc):
+    arc, position = held.arc, held.position
+    for s0, s1 in world.pieces:
+        if not np.any((arc >= s0) & (arc <= s1)):
+            # Let go of, a piece stays where it lies; but the link that bent at the grip must be straight again.
+            node = round((0.5 * (s0 + s1) - world.thread.needle_length) / world.thread.link)
+            at = int(np.searchsorted(arc, s0))
+            arc = np.insert(arc, at, world.thread.needle_length + node * world.thread.link)
+            position = np.insert(position, at, world.nodes[node], axis=0)
+    follow(world.thread, world.nodes, arc, position, world.pieces)
+    if not needle_is_placed(world):
         _trail(world)
-    return held
 
 
 def snap(world: World, arc: float, tension_mN: float, time_s: float) -> None:

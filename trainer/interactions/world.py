@@ -132,9 +132,7 @@ class World:
         now = self.solver.x[self.tissue.nodes(place.vessel)][ring.nodes]
         rotation = fit_rotation(ring.rest, now)
         surface = (
-            np.asarray(vessel.spec.cut_edge_mm)
-            + place.axial_mm * vessel.axis
-            + vessel.outer_radius_mm * ring.radial
+            np.asarray(vessel.spec.cut_edge_mm) + place.axial_mm * vessel.axis + vessel.outer_radius_mm * ring.radial
         )
         return rotation @ ring.radial, rotation @ (surface - ring.rest.mean(axis=0)) + now.mean(axis=0)
 

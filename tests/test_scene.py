@@ -1,0 +1,289 @@
+"""What a scene does with two instruments: grasping, pulling, breaking, losing, and never leaving the rails."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from performing import one_drive, perform
+
+from trainer import scene
+from trainer.curriculum import Task, load_task
+from trainer.events import Event, Grasp, Tear
+from trainer.geometry import Array, Rigid
+from trainer.interactions import thread_pull
+from trainer.interactions.thread_pull import stretch
+from trainer.poses import ToolPoses
+from trainer.profile import Hand
+from trainer.scene import Scene
+
+STITCH = load_task("anastomosis/single-stitch").task
+LEFT, RIGHT = 0, 1
+
+
+def poses(s: Scene, tool: int, position: Array, closure: float, valid: bool = True) -> ToolPoses:
+    """The instruments where they are, but ``tool`` at ``position`` with its jaws at ``closure``."""
+    now = s.view().poses
+    place, jaws, seen = now.position.copy(), now.closure.copy(), np.ones(2, dtype=bool)
+    place[tool], jaws[tool], seen[tool] = position, closure, valid
+    return ToolPoses(place, now.quaternion, jaws, seen)
+
+
+def at(s: Scene, tool: int) -> Array:
+    return np.asarray(s.view().poses.position[tool])
+
+
+def go(s: Scene, tool: int, to: Array, closure: float, step_mm: float = 0.05) -> list[Event]:
+    """Move an instrument straight to a place, ``step_mm`` at a tick."""
+    start = at(s, tool)
+    ticks = max(1, int(np.ceil(np.linalg.norm(to - start) / step_mm)))
+    events: list[Event] = []
+    for k in range(1, ticks + 1):
+        if not s.outcome:
+            events += s.step(poses(s, tool, start + k / ticks * (to - start), closure))
+    return events
+
+
+def close(s: Scene, tool: int, closure: float, ticks: int = 10) -> list[Event]:
+    start = float(s.view().poses.closure[tool])
+    return [
+        e
+        for k in range(1, ticks + 1)
+        for e in s.step(poses(s, tool, at(s, tool), start + k / ticks * (closure - start)))
+    ]
+
+
+def kinds(events: list[Event]) -> list[str]:
+    return [e.kind for e in events]
+
+
+def threaded() -> Scene:
+    """Both instruments on the thread, 4 mm of it between them, the needle dropped."""
+    s = scene.build(STITCH)
+    nodes = s.view().thread
+    assert nodes is not None
+    go(s, LEFT, nodes[40], 0.0, 0.5)
+    close(s, LEFT, 1.0)
+    close(s, RIGHT, 0.0)
+    nodes = s.view().thread
+    assert nodes is not None
+    go(s, RIGHT, nodes[20], 0.0, 0.5)
+    close(s, RIGHT, 1.0)
+    assert s.view().thread_holders == (LEFT, RIGHT)
+    return s
+
+
+def test_the_same_hand_gives_the_same_events_and_so_do_its_poses() -> None:
+    """Bit for bit: the hand repeats itself, and a scene is a function of task and poses alone."""
+    hand = Hand(tremor_rms_um=38.0, aim_error_mm=0.02, seed=3)
+    first, second = perform(one_drive(), hand), perform(one_drive(), hand)
+    assert first.events == second.events
+    again = scene.build(one_drive())
+    events = [e for p in first.poses for e in again.step(ToolPoses.unpack(p.pack()))]
+    assert tuple(events) == first.events
+
+
+def test_a_scene_has_only_what_its_task_asks_for() -> None:
+    """Without thread none is laid, without vessel nothing is solved."""
+    drive = one_drive()
+    assert scene.build(drive).world.thread is None
+    bare = replace(drive, scene=replace(drive.scene, vessel=()), step=(replace(drive.step[0], kind="withdraw"),))
+    s = scene.build(bare)
+    assert (s.world.tissue, s.world.solver) == (None, None)
+    events = s.step(s.home)
+    assert events[-1].kind == "task_done"
+
+
+def test_jaws_hold_a_wall_and_the_wall_comes_along() -> None:
+    """The held patch follows the jaws within a hundredth of the movement (the grip's stiffness is a hundred walls').
+
+    Firmly closed jaws compress the wall: the pressure limit of the task is reported once. Released, the wall goes back
+    to rest exactly, the only state without force.
+    """
+    s = scene.build(STITCH)
+    rest = s.world.solver.x.copy() if s.world.solver else np.zeros(0)
+    place, _ = s.view().look("A", 90.0, 0.2, "outer")
+    go(s, LEFT, place, 0.0, 0.5)
+    events = close(s, LEFT, 0.95)
+    grasp = next(e for e in events if isinstance(e, Grasp))
+    assert (grasp.target, grasp.body) == ("wall", "A")
+    assert kinds(events).count("overforce") == 1
+    lift = np.array([0.0, 0.02, 0.0])
+    events = go(s, LEFT, place + lift, 0.95, 0.005)
+    moved, _ = s.view().look("A", 90.0, 0.2, "outer")
+    assert "slip" not in kinds(events)
+    assert moved - place == pytest.approx(lift, abs=0.1 * 0.02)
+    assert "release" in kinds(close(s, LEFT, 0.0))
+    assert s.world.solver is not None
+    assert np.array_equal(s.world.solver.x, rest)
+
+
+def test_a_wall_pulled_too_hard_slips_or_tears_and_never_leaps() -> None:
+    """Closed fully, two pads hold 500 kPa · 0.03 mm² = 15 mN: a pull of 1.5 mm slips them off."""
+    s = scene.build(STITCH)
+    place, _ = s.view().look("A", 90.0, 0.2, "outer")
+    go(s, LEFT, place, 0.0, 0.5)
+    close(s, LEFT, 1.0)
+    events = go(s, LEFT, place + [0.0, 1.5, 0.0], 1.0, 0.05)
+    ends = [e for e in events if e.kind in ("slip", "tear")]
+    assert len(ends) == 1
+    assert s.world.jaws[LEFT].target == ""
+    s.step(poses(s, LEFT, at(s, LEFT), 1.0))
+    assert s.world.solver is not None
+    assert np.array_equal(s.world.solver.x, s.world.solver.mesh.rest)
+
+
+def test_a_thread_drawn_apart_breaks_in_firm_jaws_and_slips_from_loose_ones() -> None:
+    """Brown 2001, section 4: between two hard constraints it breaks. Fully closed jaws hold 1000 mN, the thread 710.
+
+    Jaws closed to 0.8 hold 600 mN and lose it first. The pieces keep their length either way.
+    """
+    for closure, ending in ((1.0, "break"), (0.8, "slip")):
+        s = threaded()
+        for tool in (LEFT, RIGHT):
+            close(s, tool, closure)
+        away = at(s, RIGHT) - at(s, LEFT)
+        events = go(s, RIGHT, at(s, RIGHT) + 3.0 * away, closure)
+        assert kinds(events).count(ending) == 1, (closure, kinds(events))
+        assert stretch(s.world) <= 1e-6
+        assert (s.outcome == "failed") == (ending == "break")
+
+
+def test_a_broken_thread_is_two_that_both_keep_their_length() -> None:
+    """The pieces end at the link that gave way, which is lost: lengths add up to the thread less one link."""
+    s = threaded()
+    world = s.world
+    assert world.thread is not None
+    thread_pull.snap(world, world.thread.needle_length + 6.1, 800.0, 0.0)
+    assert len(world.pieces) == 2
+    whole = world.thread.end - world.thread.needle_length
+    assert np.sum(world.pieces[:, 1] - world.pieces[:, 0]) == pytest.approx(whole - world.thread.link, abs=1e-9)
+    start = at(s, RIGHT)
+    for k in range(60):
+        s.step(poses(s, RIGHT, start + 0.05 * k * np.array([0.3, 1.0, 0.2]), 1.0))
+        assert stretch(world) <= 1e-6
+
+
+def test_a_needle_let_go_in_the_air_is_dropped_and_can_be_taken_again() -> None:
+    s = scene.build(STITCH)
+    events = close(s, RIGHT, 0.0)
+    assert kinds(events)[-2:] == ["release", "drop"]
+    needle = s.world.needle_pose.position.copy()
+    assert s.view().needle_holders == ()
+    events = close(s, RIGHT, 1.0)
+    assert "grasp" in kinds(events)
+    lift = np.array([0.0, 0.0, 1.0])
+    go(s, RIGHT, at(s, RIGHT) + lift, 1.0)
+    assert s.world.needle_pose.position == pytest.approx(needle + lift, abs=1e-9)
+
+
+def test_a_pulled_thread_draws_a_loose_needle_after_it() -> None:
+    """Nobody holds the needle: its rear end stays at the thread's first node and its length stays its own."""
+    s = scene.build(STITCH)
+    close(s, RIGHT, 0.0)
+    nodes = s.view().thread
+    assert nodes is not None
+    go(s, LEFT, nodes[3], 0.0, 0.5)
+    close(s, LEFT, 1.0)
+    go(s, LEFT, at(s, LEFT) + np.array([3.0, 4.0, 2.0]), 1.0)
+    assert thread_pull.swage(s.world) == pytest.approx(s.world.nodes[0], abs=1e-9)
+    assert stretch(s.world) <= 1e-6
+    assert np.linalg.norm(thread_pull.swage(s.world) - at(s, LEFT)) <= 3 * 0.2 + 0.25 + 1e-6
+
+
+def test_a_flat_needle_glides_along_the_wall_without_a_hole() -> None:
+    """Below the task's skid angle the tip does not stick; it may press, but 0.05 mm of pressing is no puncture."""
+    task = one_drive()
+    s = scene.build(task)
+    needle = s.world.needle_pose
+    point, normal = s.view().look("A", 0.0, 0.6, "outer")
+    axis = s.view().vessel_axis["A"]
+    steep = np.radians(5.0)
+    heading = np.cos(steep) * axis - np.sin(steep) * normal
+    from trainer.drivers.hand_motion import needle_pose
+
+    flat = needle_pose(point - 0.3 * heading, heading, np.cos(steep) * normal + np.sin(steep) * axis, 0.0, 1.613)
+    offset = needle.inverse() @ s.view().poses.world_from_tool(RIGHT)
+
+    def step(pose: Rigid) -> tuple[Event, ...]:
+        tool = pose @ offset
+        home = s.home
+        return s.step(
+            ToolPoses(
+                np.array([home.position[LEFT], tool.position]),
+                np.array([home.quaternion[LEFT], tool.quaternion]),
+                home.closure,
+                np.ones(2, dtype=bool),
+            )
+        )
+
+    events: list[Event] = []
+    for k in range(90):
+        events += step(Rigid(flat.position + 0.01 * k * heading, flat.quaternion))
+    assert "contact" in kinds(events)
+    assert "pierce" not in kinds(events)
+
+
+def test_a_lost_instrument_stays_and_comes_back() -> None:
+    """Frozen in place with its jaws, reported once at each end; the needle in its jaws stays with it."""
+    s = scene.build(STITCH)
+    tip = s.world.needle_pose.position.copy()
+    far = at(s, RIGHT) + np.array([50.0, 0.0, 0.0])
+    lost = [e for _ in range(5) for e in s.step(poses(s, RIGHT, far, 0.0, valid=False))]
+    assert kinds(lost).count("tracking_lost") == 1
+    assert s.world.needle_pose.position == pytest.approx(tip, abs=1e-12)
+    back = s.step(poses(s, RIGHT, at(s, RIGHT), 1.0))
+    assert kinds(list(back)) == ["tracking_back"]
+    assert back[0].lost_s == pytest.approx(0.05)  # type: ignore[attr-defined]
+
+
+def leaping() -> Task:
+    return replace(STITCH, time_limit_s=2.0)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_tracker_that_leaps_leaves_everything_finite_and_the_thread_whole(seed: int) -> None:
+    """Poses thrown up to 20 mm from tick to tick through the vessels, jaws snapping: two seconds of rubbish.
+
+    Nothing may become infinite, no link may stretch, and what tears is reported above its limit.
+    """
+    rng = np.random.default_rng(seed)
+    s = scene.build(leaping())
+    while not s.outcome:
+        q = rng.normal(size=(2, 4))
+        q /= np.linalg.norm(q, axis=1, keepdims=True)
+        spread = 10.0 if s.tick % 7 == 0 else 0.3
+        events = s.step(ToolPoses(rng.normal(0.0, spread, (2, 3)), q, rng.random(2), rng.random(2) > 0.1))
+        assert s.world.solver is not None
+        assert np.isfinite(s.world.solver.x).all()
+        assert np.isfinite(s.world.nodes).all()
+        assert stretch(s.world) <= 1e-6
+        for e in events:
+            if isinstance(e, Tear):
+                assert e.force_mN > e.limit_mN
+
+
+def test_refuses_poses_for_another_number_of_instruments() -> None:
+    s = scene.build(STITCH)
+    with pytest.raises(ValueError, match="2 instruments need 2 poses, found 1"):
+        s.step(ToolPoses(np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]]), np.zeros(1), np.ones(1, dtype=bool)))
+
+
+def test_the_last_event_says_where_everything_is() -> None:
+    s = scene.build(STITCH)
+    s.step(s.home)
+    aborted, done = s.finish("aborted", "interrupted")
+    assert aborted.kind == "aborted"
+    assert done.needle_tip == pytest.approx(tuple(s.world.needle_pose.position))  # type: ignore[attr-defined]
+    assert done.thread_end == pytest.approx(tuple(s.world.nodes[-1]))  # type: ignore[attr-defined]
+    assert s.outcome == "aborted"
+
+
+def test_the_time_limit_ends_the_exercise() -> None:
+    s = scene.build(replace(STITCH, time_limit_s=0.1))
+    ticks = 0
+    while not s.outcome:
+        s.step(s.home)
+        ticks += 1
+    assert (s.outcome, ticks) == ("timeout", 10)
