@@ -6,8 +6,10 @@ a small dense problem in the 3 u coordinates of the u points in use.
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -57,8 +59,7 @@ class Loads:
         return Loads(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
 
 
-@dataclass(frozen=True)
-class Rows:
+class Rows(NamedTuple):
     """Anchors, cables and loads of one solve, flattened for the kernels; ``at`` counts the points in use."""
 
     slots: np.ndarray  # (u,) the slots in use, ascending
@@ -75,9 +76,12 @@ class Rows:
 
 def flatten(anchors: Anchors, cables: tuple[Cable, ...], loads: Loads) -> Rows:
     """The rows of one solve. Raises ValueError when a number is not finite or a cable has fewer than two points."""
-    cable_slot = np.concatenate([np.zeros(0, dtype=np.int64), *(c.slot for c in cables)]).astype(np.int64)
-    cable_place = np.concatenate([np.zeros((0, 3)), *(np.asarray(c.place, dtype=np.float64) for c in cables)])
-    cable_place = np.where((cable_slot == -1)[:, None], cable_place, 0.0)
+    count = [len(c.slot) for c in cables]
+    cable_slot = np.array([n for c in cables for n in c.slot.tolist()], dtype=np.int64)
+    cable_place = np.zeros((len(cable_slot), 3))
+    for last, size, cable in zip(itertools.accumulate(count), count, cables, strict=True):
+        cable_place[last - size : last] = cable.place
+    cable_place[cable_slot >= 0] = 0.0
     length = np.array([c.length_mm for c in cables], dtype=np.float64)
     for name, values in (
         ("an anchor's target", anchors.target),
@@ -86,22 +90,25 @@ def flatten(anchors: Anchors, cables: tuple[Cable, ...], loads: Loads) -> Rows:
         ("a cable's length", length),
         ("a load", loads.force),
     ):
-        if not np.all(np.isfinite(values)):
+        if values.size and not np.isfinite(values).all():
             raise ValueError(f"{name} is not finite")
-    if any(len(c.slot) < 2 for c in cables):
+    if any(n < 2 for n in count):
         raise ValueError("a cable needs at least two points")
-    slots = np.unique(np.concatenate([anchors.slot, cable_slot[cable_slot >= 0], loads.slot])).astype(np.int64)
+    on_anchors, on_cables, on_loads = anchors.slot.tolist(), cable_slot.tolist(), loads.slot.tolist()
+    slots = sorted({*on_anchors, *(n for n in on_cables if n >= 0), *on_loads})
+    at = {-1: -1} | {slot: u for u, slot in enumerate(slots)}
     load = np.zeros((len(slots), 3))
-    np.add.at(load, np.searchsorted(slots, loads.slot), loads.force)
+    for slot, f in zip(on_loads, loads.force, strict=True):
+        load[at[slot]] += f
     return Rows(
-        slots=slots,
-        anchor_at=np.searchsorted(slots, anchors.slot).astype(np.int64),
+        slots=np.array(slots, dtype=np.int64),
+        anchor_at=np.array([at[n] for n in on_anchors], dtype=np.int64),
         target=np.array(anchors.target, dtype=np.float64),
-        stiffness=np.ascontiguousarray(anchors.stiffness, dtype=np.float64),
-        cable_start=np.concatenate([[0], np.cumsum([len(c.slot) for c in cables])]).astype(np.int64),
-        cable_at=np.where(cable_slot < 0, -1, np.searchsorted(slots, cable_slot)).astype(np.int64),
-        cable_place=np.ascontiguousarray(cable_place),
-        channel=np.concatenate([np.zeros(0, dtype=np.bool_), *(c.channel for c in cables)]).astype(np.bool_),
+        stiffness=np.array(anchors.stiffness, dtype=np.float64),
+        cable_start=np.array([0, *itertools.accumulate(count)], dtype=np.int64),
+        cable_at=np.array([at[n] for n in on_cables], dtype=np.int64),
+        cable_place=cable_place,
+        channel=np.array([n for c in cables for n in c.channel.tolist()], dtype=np.bool_),
         length=length,
         load=load,
     )
@@ -110,17 +117,9 @@ def flatten(anchors: Anchors, cables: tuple[Cable, ...], loads: Loads) -> Rows:
 @njit(cache=True, nogil=True, error_model="numpy")
 def pull(
     p: Array,
-    anchor_at: np.ndarray,
-    target: Array,
-    anchor_stiffness: Array,
-    cable_start: np.ndarray,
-    cable_at: np.ndarray,
-    cable_place: Array,
-    channel: np.ndarray,
-    length: Array,
+    rows: Rows,
     multiplier: Array,
     penalty: Array,
-    load: Array,
     row: Array,
     force: Array,
     matrix: Array,
@@ -132,15 +131,17 @@ def pull(
     (T² - m²) / (2 k) with the tension T = max(0, m + k (s - L)) (Rockafellar 1973). Its second derivative,
     k d dᵀ + T ∂²s/∂p² with d = ∂s/∂p, is positive semidefinite, because a path length is convex.
 
-    Reads ``p`` (u, 3) mm and the fields of Rows, ``multiplier`` (c,) mN, ``penalty`` (c,) mN/mm. Overwrites ``row``
+    Reads ``p`` (u, 3) mm, ``rows``, ``multiplier`` (c,) mN, ``penalty`` (c,) mN/mm. Overwrites ``row``
     (k, 3), ``force`` (u, 3) mN, ``matrix`` (3 u, 3 u) mN/mm and ``stretch`` (c,) = s - L mm.
     """
+    anchor_at, target, anchor_stiffness = rows.anchor_at, rows.target, rows.stiffness
+    cable_start, cable_at, cable_place, channel = rows.cable_start, rows.cable_at, rows.cable_place, rows.channel
     energy = 0.0
     matrix[:] = 0.0
     for i in range(len(p)):
         for r in range(3):
-            force[i, r] = load[i, r]
-            energy -= load[i, r] * p[i, r]
+            force[i, r] = rows.load[i, r]
+            energy -= rows.load[i, r] * p[i, r]
     for a in range(len(anchor_at)):
         i = anchor_at[a]
         for r in range(3):
@@ -150,7 +151,7 @@ def pull(
                 matrix[3 * i + r, 3 * i + c] += anchor_stiffness[a, r, c]
             force[i, r] += f
             energy += 0.5 * f * (target[a, r] - p[i, r])
-    for n in range(len(length)):
+    for n in range(len(rows.length)):
         first, last = cable_start[n], cable_start[n + 1]
         path = 0.0
         for k in range(first, last):
@@ -171,7 +172,7 @@ def pull(
             row[k + 1, 0] += d0 / s
             row[k + 1, 1] += d1 / s
             row[k + 1, 2] += d2 / s
-        stretch[n] = path - length[n]
+        stretch[n] = path - rows.length[n]
         tension = max(0.0, multiplier[n] + penalty[n] * stretch[n])
         energy += (tension * tension - multiplier[n] * multiplier[n]) / (2.0 * penalty[n])
         if tension == 0.0:

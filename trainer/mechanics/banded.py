@@ -11,7 +11,7 @@ entries, exactly symmetric and positive definite: a base for iterations that mea
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -22,8 +22,7 @@ from trainer.geometry import Array
 SINGULAR = 1e-9
 
 
-@dataclass(frozen=True)
-class BandedFactor:
+class BandedFactor(NamedTuple):
     """L and D of K = L D Lᵀ for the nodes ``order``; the unknown 3 p + c is component c of node ``order[p]``."""
 
     order: np.ndarray  # (f,) int32 nodes, in the order of elimination
@@ -153,25 +152,46 @@ def scatter(v: Array, order: np.ndarray, values: Array) -> None:
             values[order[p], c] = v[3 * p + c]
 
 
-class Factoring:
-    """A factorisation that can be done a little at a time."""
+@njit(cache=True, nogil=True, error_model="numpy")
+def solve(kept: BandedFactor, values: Array, v: Array, out: Array) -> None:
+    """K⁻¹ of the forces ``values`` (n, 3) mN on the factor's nodes into the same rows of ``out`` (n, 3) mm.
 
-    def __init__(self, blocks: Array, links: np.ndarray, order: np.ndarray, node_count: int) -> None:
-        """Of the stiffness that the link blocks (m, 3, 3) add up to on the nodes ``order`` (f,)."""
-        place = np.full(node_count, -1, dtype=np.int32)
-        place[order] = np.arange(len(order), dtype=np.int32)
-        ends = place[links]
+    Overwrites ``v``, at least (3 f,).
+    """
+    u = v[: len(kept.inverse)]
+    gather(values, kept.order, u)
+    substitute_forwards(kept.columns, kept.inverse, u)
+    substitute_backwards(kept.columns, u)
+    scatter(u, kept.order, out)
+
+
+class Factoring:
+    """A factorisation that can be done a little at a time, and again: its memory is kept."""
+
+    def __init__(self, links: np.ndarray, order: np.ndarray, node_count: int) -> None:
+        """Of a stiffness that the ``links`` (m, 2) add up to on the nodes ``order`` (f,)."""
+        self._place = np.full(node_count, -1, dtype=np.int32)
+        self._place[order] = np.arange(len(order), dtype=np.int32)
+        self._links = links
+        ends = self._place[links]
         ends = ends[np.all(ends >= 0, axis=1)]
         reach = int(np.max(np.abs(ends[:, 1] - ends[:, 0]), initial=0))
         size = 3 * len(order)
         b = min(3 * reach + 2, size - 1)
-        self._band = np.zeros((size, b + 1))
-        assemble_band(blocks, links, place, self._band)
-        self._diagonal = self._band[:, 0].copy()
-        columns = np.zeros((size, b), dtype=np.float32)
-        self.factor = BandedFactor(np.ascontiguousarray(order, dtype=np.int32), columns, np.zeros(size))
+        # Written now: a page of memory that is touched for the first time costs time, milliseconds for these.
+        self._band = np.full((size, b + 1), 0.0)
+        self._diagonal = np.zeros(size)
         self._next = 0
+        columns = np.full((size, b), 0.0, dtype=np.float32)
+        self.factor = BandedFactor(np.ascontiguousarray(order, dtype=np.int32), columns, np.zeros(size))
         self.replaced = 0  # pivots that were too small: the factor is of no use
+
+    def begin(self, blocks: Array) -> None:
+        """Of the link blocks (m, 3, 3); ``factor`` is overwritten."""
+        self._band[:] = 0.0
+        assemble_band(blocks, self._links, self._place, self._band)
+        self._diagonal[:] = self._band[:, 0]
+        self._next = self.replaced = 0
 
     def advance(self, count: int, least: float = SINGULAR) -> bool:
         """Eliminates ``count`` more unknowns; True when ``factor`` is complete. ``least``: see factor_band."""
@@ -188,17 +208,9 @@ def factor(blocks: Array, links: np.ndarray, order: np.ndarray, node_count: int)
     Raises ValueError when the matrix is not positive definite, that is when the nodes can move without
     stretching a link.
     """
-    work = Factoring(blocks, links, order, node_count)
+    work = Factoring(links, order, node_count)
+    work.begin(blocks)
     work.advance(3 * len(order))
     if work.replaced:
         raise ValueError("the links do not hold all free nodes in place: the stiffness matrix is singular")
     return work.factor
-
-
-def solve(kept: BandedFactor, values: Array, out: Array) -> None:
-    """K⁻¹ of the forces ``values`` (n, 3) mN on the factor's nodes into the same rows of ``out`` (n, 3) mm."""
-    v = np.empty(len(kept.inverse))
-    gather(values, kept.order, v)
-    substitute_forwards(kept.columns, kept.inverse, v)
-    substitute_backwards(kept.columns, v)
-    scatter(v, kept.order, out)

@@ -14,7 +14,9 @@ from trainer.mechanics.links import LinkMesh, link_blocks
 from trainer.mechanics.quasi_newton import at_points
 
 #: Slices into which a new factorisation is divided.
-SLICES = 12
+SLICES = 20
+#: Solves for which a new factor is used before another one of the same body may be begun.
+LASTS = 15
 #: At rest no pivot is below 0.4 of the diagonal. A state in which one is below this is nearly or truly unstable.
 LEAST_PIVOT = 0.05
 
@@ -27,24 +29,28 @@ class Compliance:
         stretching a link."""
         n = len(mesh.rest)
         self._mesh = mesh
-        self._orders = orders
-        self._blocks = np.zeros((len(mesh.links), 3, 3))
-        link_blocks(mesh.rest, mesh.links, mesh.rest_length, mesh.stiffness, False, self._blocks)
-        self.factors = [banded.factor(self._blocks, mesh.links, order, n) for order in orders]
         self._first = np.array([int(o.min()) for o in orders])
         self.nodes = [(int(o.min()), int(o.max()) + 1) for o in orders]  # rows of each body's free nodes
         body = self.body_of(mesh.links.min(axis=1))
         at = [np.flatnonzero(body == b) for b in range(len(orders))]
         self.links = [(int(r[0]), int(r[-1]) + 1) for r in at]
+        self.factors = [
+            banded.factor(self._stiffness(b, mesh.rest, False), mesh.links[lo:hi], orders[b], n)
+            for b, (lo, hi) in enumerate(self.links)
+        ]
+        # The next factor of each body.
+        self._next = [banded.Factoring(mesh.links[lo:hi], orders[b], n) for b, (lo, hi) in enumerate(self.links)]
+        self._v = np.zeros(3 * max(len(order) for order in orders))
+        self._push = np.zeros((n, 3))
         self._free: list[int] = []
         self.slot_nodes = np.zeros((0, 3), dtype=np.int64)
         self.slot_weights = np.zeros((0, 3))  # zero for a slot that is free
         self.slot_range = np.zeros((0, 2), dtype=np.int64)  # rows of the nodes of the slot's body
         self.columns = np.zeros((0, 3, n, 3))  # K⁻¹ Wᵀ, mm per mN
         self.matrix = np.zeros((0, 0))  # W K⁻¹ Wᵀ over all slots
-        self._age = [0] * len(orders)  # how many factors ago each body's was made
-        self._under_way: tuple[int, banded.Factoring] | None = None
-        self._at = mesh.rest
+        self._age = [LASTS] * len(orders)  # how many solves ago each body's factor was made
+        self._under_way: int | None = None  # the body whose next factor is being made
+        self._at = mesh.rest.copy()  # … at this state
         self._projected = False
         self._ready: dict[int, Array] = {}  # columns for the factor under way
 
@@ -61,7 +67,7 @@ class Compliance:
         self.slot_nodes[slot] = nodes
         self.slot_weights[slot] = weights
         self.slot_range[slot] = self.nodes[body]
-        self.columns[slot] = self._answers(slot, self.factors[body])
+        self._answers(slot, self.factors[body], self.columns[slot])
         self._couple(slot)
         return slot
 
@@ -73,54 +79,65 @@ class Compliance:
         self._free.sort()
 
     def refresh(self, bodies: list[int], x: Array) -> None:
-        """Begins to factor one of ``bodies`` at ``x`` (n, 3), that of the oldest factor; unless one is under way."""
+        """Begins to factor one of ``bodies`` at ``x`` (n, 3), that of the oldest factor; unless one is under way, or
+        none is older than LASTS."""
         if self._under_way is not None or not bodies:
             return
         body = max(bodies, key=lambda b: (self._age[b], -b))
-        self._under_way = body, self._factoring(body, x, project=False)
-        self._at = x.copy()
+        if self._age[body] < LASTS:
+            return
+        self._at[:] = x
+        self._begin(body, project=False)
 
     def advance(self) -> None:
         """One slice of the work that :meth:`refresh` began; the last one changes the factor and the columns."""
-        if self._under_way is None:
+        self._age = [age + 1 for age in self._age]
+        body = self._under_way
+        if body is None:
             return
-        body, work = self._under_way
+        work = self._next[body]
         complete = work.advance(-(-len(work.factor.inverse) // SLICES), LEAST_PIVOT)
         if work.replaced and not self._projected:
             # Shortened links make the plain stiffness indefinite here; without their softening it is not.
-            self._under_way = body, self._factoring(body, self._at, project=True)
+            self._begin(body, project=True)
             return
         if not complete:
             return
         held = np.flatnonzero((self.slot_range[:, 0] == self.nodes[body][0]) & np.any(self.slot_weights != 0.0, axis=1))
         waiting = [int(s) for s in held if int(s) not in self._ready]
         if waiting:
-            self._ready[waiting[0]] = self._answers(waiting[0], work.factor)
+            self._ready[waiting[0]] = np.zeros(self.columns.shape[1:])
+            self._answers(waiting[0], work.factor, self._ready[waiting[0]])
             return
-        self.factors[body] = work.factor
+        self.factors[body], work.factor = work.factor, self.factors[body]
         for slot in held:
             self.columns[slot] = self._ready[int(slot)]
         for slot in held:
             self._couple(int(slot))
-        self._age = [0 if b == body else age + 1 for b, age in enumerate(self._age)]
+        self._age[body] = 0
         self._under_way = None
         self._ready = {}
 
-    def _factoring(self, body: int, x: Array, project: bool) -> banded.Factoring:
-        m = self._mesh
-        link_blocks(x, m.links, m.rest_length, m.stiffness, project, self._blocks)
-        self._projected = project
-        return banded.Factoring(self._blocks, m.links, self._orders[body], len(m.rest))
+    def _begin(self, body: int, project: bool) -> None:
+        self._under_way, self._projected = body, project
+        self._next[body].begin(self._stiffness(body, self._at, project))
 
-    def _answers(self, slot: int, factor: banded.BandedFactor) -> Array:
-        """The displacements (3, n, 3) of all nodes by a unit force on the slot along x, y and z."""
-        out = np.zeros((3, *self._mesh.rest.shape))
-        push = np.zeros_like(self._mesh.rest)
-        for r in range(3):
-            push[self.slot_nodes[slot]] = 0.0
-            np.add.at(push[:, r], self.slot_nodes[slot], self.slot_weights[slot])
-            banded.solve(factor, push, out[r])
+    def _stiffness(self, body: int, x: Array, project: bool) -> Array:
+        """The blocks (m, 3, 3) of the body's links at ``x``."""
+        m, (lo, hi) = self._mesh, self.links[body]
+        out = np.zeros((hi - lo, 3, 3))
+        link_blocks(x, m.links[lo:hi], m.rest_length[lo:hi], m.stiffness[lo:hi], project, out)
         return out
+
+    def _answers(self, slot: int, factor: banded.BandedFactor, out: Array) -> None:
+        """The displacements ``out`` (3, n, 3) of all nodes by a unit force on the slot along x, y and z."""
+        out[:] = 0.0
+        nodes, push = self.slot_nodes[slot], self._push
+        for r in range(3):
+            push[nodes] = 0.0
+            np.add.at(push[:, r], nodes, self.slot_weights[slot])
+            banded.solve(factor, push, self._v, out[r])
+        push[nodes] = 0.0
 
     def _couple(self, slot: int) -> None:
         mean = np.zeros((len(self.slot_nodes), 3))

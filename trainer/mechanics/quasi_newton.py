@@ -77,11 +77,13 @@ def before_base(
     q: Array,
     s: Array,
     y: Array,
+    product: Array,
     newest: int,
     count: int,
     matrix: Array,
     nodes: np.ndarray,
     weights: Array,
+    awake: np.ndarray,
     first: int,
     last: int,
     moved: Array,
@@ -91,15 +93,18 @@ def before_base(
 ) -> None:
     """The first loop: overwrites the gradient ``q`` (n, 3), newest pair first.
 
-    ``s``, ``y`` (m, n, 3) hold the pairs in a ring that ends at ``newest``. Overwrites ``moved``, ``pulled``
-    (m, u, 3), ``curvature`` and ``share`` (m,) for the second loop. A pair of no positive curvature is passed over.
+    ``s``, ``y`` (m, n, 3) hold the pairs in a ring that ends at ``newest``, and ``product`` (m, bodies) s · y of each
+    body. Overwrites ``moved``, ``pulled`` (m, u, 3), ``curvature`` and ``share`` (m,) for the second loop. A pair of no
+    positive curvature is passed over.
     """
     pairs = len(s)
     for age in range(count):
         k = (newest - age) % pairs
         at_points(s[k], nodes, weights, moved[k])
         multiply(matrix, moved[k], pulled[k])
-        c = dot(s[k], y[k], first, last)
+        c = 0.0
+        for b in awake:
+            c += product[k, b]
         for i in range(len(nodes)):
             for r in range(3):
                 c += moved[k, i, r] * pulled[k, i, r]
