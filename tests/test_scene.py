@@ -125,7 +125,7 @@ def test_a_wall_pulled_too_hard_slips_or_tears_and_never_leaps() -> None:
     place, _ = s.view().look("A", 90.0, 0.2, "outer")
     go(s, LEFT, place, 0.0, 0.5)
     close(s, LEFT, 1.0)
-    events = go(s, LEFT, place + [0.0, 1.5, 0.0], 1.0, 0.05)
+    events = go(s, LEFT, [*place, 0.0, 1.5, 0.0], 1.0, 0.05)
     ends = [e for e in events if e.kind in ("slip", "tear")]
     assert len(ends) == 1
     assert s.world.jaws[LEFT].target == ""

@@ -73,7 +73,7 @@ def test_a_surface_that_overtakes_a_resting_point_crosses_it() -> None:
     """The wall springs back over a tip that stands still: half-way up, at half of the motion, from below."""
     x = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, -1.0], [0.0, 1.0, -1.0]])
     rest = np.array([0.25, 0.25, 0.0])
-    hit = first_crossing(rest, rest, x, x + [0.0, 0.0, 2.0], TRIANGLE, NONE)
+    hit = first_crossing(rest, rest, x, x + np.array([0.0, 0.0, 2.0]), TRIANGLE, NONE)
     assert hit is not None
     assert hit[1] == pytest.approx(0.5)
     assert hit[2] is True

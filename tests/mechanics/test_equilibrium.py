@@ -227,7 +227,7 @@ def test_a_thread_does_not_draw_the_two_holes_of_its_channel_together(tissue: Ti
     nodes, weights = wall_point(tissue.vessels[0], 0.0, 0.5, "inner")
     inner = state.hold(nodes, weights)
     slots = np.array([-1, outer, inner, -1])
-    ends = np.array([state.position(outer) + (0.8, 0.0, 0.8), np.zeros(3), np.zeros(3), (0.5, 0.0, 0.2)])
+    ends = np.array([state.position(outer) + np.array([0.8, 0.0, 0.8]), np.zeros(3), np.zeros(3), (0.5, 0.0, 0.2)])
     outside = float(np.linalg.norm(ends[0] - state.position(outer)) + np.linalg.norm(ends[3] - state.position(inner)))
     channel = np.array([False, True, False, False])
     answer = state.solve(cables=(Cable(slots, ends, outside - 0.05, channel),), tolerance_mN=1e-6)

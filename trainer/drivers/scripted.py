@@ -7,6 +7,7 @@ What they intend (angle, bite, clock) comes from the profile, or from the task's
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator
 
@@ -14,10 +15,11 @@ import numpy as np
 
 from trainer.curriculum import Step, Task
 from trainer.drivers.hand_motion import Tremor, along_arc, between, ease, needle_pose, round_vessel, turn_angle
-from trainer.geometry import Array, Rigid, cross, quaternion_from_axes, unit
+from trainer.drivers.sight import Lost, Sight, steepest_from_lumen
+from trainer.geometry import Array, Rigid, quaternion_from_axes, unit
 from trainer.poses import ToolPoses
 from trainer.profile import Hand
-from trainer.view import HoleView, View
+from trainer.view import View
 
 Movement = Iterator[None]  # yields once per tick
 
@@ -27,18 +29,11 @@ RUN_UP_MM = 0.4  # the tip's distance from the wall at which pressing begins
 STEER_DEG = 50.0  # inside a lumen the needle is steered to this angle, to leave by the cut end
 STAND_OFF_MM = 1.5  # an instrument's distance before it reaches for something
 CLEAR_MM = 2.5  # distance from a vessel's axis while moving round it
-ASIDE_DEG = 40.0  # at most this far from the vessel's axis lies the needle's plane
-CLEAR_PAST_MM = 0.06  # distance at which the needle passes the other end of the vessel
 BITE_DEPTH_MM = 2.0  # arc beyond a hole at which the other hand takes over
 TAKE_AT_MM = 0.6  # distance from the tip at which the other hand takes the needle
-RISE = 0.4  # how steeply the thread is pulled away from the vessels
 TRIES = 5  # at catching needle or thread
 JAW_S = 0.15  # time to open or close the jaws
 TURN = 2.0  # fastest turn of an instrument, rad/s (assumed)
-
-
-class _Lost(Exception):
-    """What the hand meant to do is no longer possible: it stops."""
 
 
 class ScriptedHands:
@@ -54,7 +49,7 @@ class ScriptedHands:
         self._pose = [home.world_from_tool(i) for i in range(count)]  # intended, without tremor
         self._closure = home.closure.copy()
         self._plan: Movement | None = None
-        self._view: View
+        self._see: Sight
         self._stopped = ""
         needle = task.scene.needle
         self._needle_length = needle.length_mm if needle else 0.0
@@ -62,14 +57,15 @@ class ScriptedHands:
 
     def poll(self, tick: int, view: object) -> ToolPoses | None:
         assert isinstance(view, View)
-        self._view = view
         if self._plan is None:
+            self._see = Sight(self._task, view, self._needle_length, self._radius)
             self._plan = self._perform()
+        self._see.view = view
         try:
             next(self._plan)
         except StopIteration:
             return None
-        except _Lost as reason:
+        except Lost as reason:
             self._stopped = str(reason)
             return None
         return ToolPoses(
@@ -104,10 +100,10 @@ class ScriptedHands:
 
     def _drive(self, step: Step, through: bool) -> Movement:
         hand = self._hand
-        driving = self._holder()
-        if not self._needle_is_through():
-            raise _Lost("the needle is still in a hole")
-        vessel = self._task_vessel(step.vessel)
+        driving = self._see.holder()
+        if not self._see.needle_is_through():
+            raise Lost("the needle is still in a hole")
+        vessel = self._see.task_vessel(step.vessel)
         radius = 0.5 * vessel.outer_diameter_mm
         bite = (hand.bite_mm or step.bite_mm) + self._rng.normal(0.0, hand.aim_error_mm)
         bite = min(max(bite, 0.05), 0.6 * vessel.length_mm)
@@ -115,14 +111,14 @@ class ScriptedHands:
         clock += math.degrees(self._rng.normal(0.0, hand.aim_error_mm) / radius)
         angle = 90.0 if hand.entry_angle_deg is None else hand.entry_angle_deg
         angle = 90.0 - abs(90.0 - angle - self._rng.normal(0.0, hand.entry_angle_error_deg))
-        aside = self._aside(bite)
+        aside = self._see.aside(bite)
         if step.direction == "out":
-            angle = min(angle, _steepest_from_lumen(bite, aside, radius, vessel.wall_mm, self._radius))
+            angle = min(angle, steepest_from_lumen(bite, aside, radius, vessel.wall_mm, self._radius))
         if driving != 1 and through:
             yield from self._hand_over(driving)
-            driving = self._holder()
+            driving = self._see.holder()
         if step.direction == "in":
-            rest, _ = self._view.look(step.vessel, clock, bite, "outer")
+            rest, _ = self._see.view.look(step.vessel, clock, bite, "outer")
             yield from self._enter_from_outside(driving, step.vessel, clock, bite, math.radians(angle), aside)
             if through:
                 yield from self._steer_out(step.vessel, driving, rest, aside)
@@ -134,63 +130,63 @@ class ScriptedHands:
     def _enter_from_outside(
         self, tool: int, vessel: str, clock: float, bite: float, angle: float, aside: float
     ) -> Movement:
-        point, normal = self._view.look(vessel, clock, bite, "outer")
-        tangent, inward = self._heading_in(vessel, normal, angle, aside)
-        offset = self._needle_from_tool(tool)
+        point, normal = self._see.view.look(vessel, clock, bite, "outer")
+        tangent, inward = self._see.heading_in(vessel, normal, angle, aside)
+        offset = self._see.needle_from_tool(tool)
         start = needle_pose(point - RUN_UP_MM * tangent, tangent, inward, 0.0, self._radius)
         yield from self._carry_round(tool, start, offset, vessel)
-        tip = self._needle().position
+        tip = self._see.needle().position
         travelled = 0.0
-        while not self._hole(vessel, "outer"):
-            _, normal = self._view.look(vessel, clock, bite, "outer")
-            tangent, inward = self._heading_in(vessel, normal, angle, aside)
+        while not self._see.hole(vessel, "outer"):
+            _, normal = self._see.view.look(vessel, clock, bite, "outer")
+            tangent, inward = self._see.heading_in(vessel, normal, angle, aside)
             tip = tip + self._press_step() * tangent
             travelled += self._press_step()
             if travelled > RUN_UP_MM + 1.5:
-                raise _Lost("the wall does not give way")
+                raise Lost("the wall does not give way")
             self._pose[tool] = needle_pose(tip, tangent, inward, 0.0, self._radius) @ offset
             yield
-        yield from self._follow_arc(tool, offset, lambda: bool(self._hole(vessel, "inner")), 1.0, PRESS)
+        yield from self._follow_arc(tool, offset, lambda: bool(self._see.hole(vessel, "inner")), 1.0, PRESS)
 
     def _enter_from_lumen(
         self, tool: int, vessel: str, clock: float, bite: float, angle: float, aside: float
     ) -> Movement:
-        target, normal = self._view.look(vessel, clock, bite, "outer")
-        wall = self._task_vessel(vessel).wall_mm
-        tangent, inward = self._heading_out(vessel, normal, angle, aside)
-        offset = self._needle_from_tool(tool)
+        target, normal = self._see.view.look(vessel, clock, bite, "outer")
+        wall = self._see.task_vessel(vessel).wall_mm
+        tangent, inward = self._see.heading_out(vessel, normal, angle, aside)
+        offset = self._see.needle_from_tool(tool)
         contact = needle_pose(target - tangent * wall / math.sin(angle), tangent, inward, 0.0, self._radius)
         # The shaft of a needle at the wall leaves the lumen by the cut end, so the tip comes in along that same arc.
         back = (2.0 * angle + 0.9) * self._radius
         yield from self._carry_round(tool, along_arc(contact, -back, self._radius), offset, vessel)
         run = 0.5 * RUN_UP_MM
         yield from self._slide_along_arc(tool, contact, offset, -back, -run)
-        tip = self._needle().position
+        tip = self._see.needle().position
         travelled = 0.0
-        while not self._hole(vessel, "outer"):
-            target, normal = self._view.look(vessel, clock, bite, "outer")
-            tangent, inward = self._heading_out(vessel, normal, angle, aside)
-            way = target - self._needle().position
+        while not self._see.hole(vessel, "outer"):
+            target, normal = self._see.view.look(vessel, clock, bite, "outer")
+            tangent, inward = self._see.heading_out(vessel, normal, angle, aside)
+            way = target - self._see.needle().position
             aim = unit(way) if way @ tangent > AIMED_MM else tangent
             tip = tip + self._press_step() * aim
             travelled += self._press_step()
             if travelled > run + wall / math.sin(angle) + 1.5:
-                raise _Lost("the wall does not give way")
+                raise Lost("the wall does not give way")
             self._pose[tool] = needle_pose(tip, tangent, inward, 0.0, self._radius) @ offset
             yield
         yield from self._follow_arc(
-            tool, offset, lambda: self._arc_in(vessel, "outer") >= BITE_DEPTH_MM, BITE_DEPTH_MM + 1.0, 1.0
+            tool, offset, lambda: self._see.arc_in(vessel, "outer") >= BITE_DEPTH_MM, BITE_DEPTH_MM + 1.0, 1.0
         )
 
     def _steer_out(self, vessel: str, tool: int, rest: Array, aside: float) -> Movement:
         """Let the dent go back to where the wall was at ``rest``, pivot there towards the cut end, and advance."""
-        hole = self._hole(vessel, "outer")
+        hole = self._see.hole(vessel, "outer")
         if hole is None:
-            raise _Lost("the needle has left its hole")
-        offset = self._needle_from_tool(tool)
+            raise Lost("the needle has left its hole")
+        offset = self._see.needle_from_tool(tool)
         point, s0 = hole.point.copy(), hole.arc_mm
-        normal = self._outward(vessel, rest)
-        needle = self._needle().matrix()
+        normal = self._see.outward(vessel, rest)
+        needle = self._see.needle().matrix()
         phi = s0 / self._radius
         tangent = math.cos(phi) * needle[:, 0] - math.sin(phi) * needle[:, 1]
         steep0 = math.asin(min(1.0, max(-1.0, float(-tangent @ normal))))
@@ -200,7 +196,7 @@ class ScriptedHands:
         for k in range(1, ticks + 1):
             u = ease(k / ticks)
             pivoted = min(1.0, 3.0 * u)
-            t, c = self._heading_in(vessel, normal, steep0 + pivoted * (steep1 - steep0), aside)
+            t, c = self._see.heading_in(vessel, normal, steep0 + pivoted * (steep1 - steep0), aside)
             at = point + pivoted * (rest - point)
             self._pose[tool] = needle_pose(at, t, c, s0 + u * (BITE_DEPTH_MM - s0), self._radius) @ offset
             yield
@@ -209,62 +205,62 @@ class ScriptedHands:
         """The other hand takes the needle near its tip and draws it through, with the thread after it."""
         yield from self._hand_over(driving, TAKE_AT_MM)
         taking = 1 - driving
-        offset = self._needle_from_tool(taking)
-        yield from self._follow_arc(taking, offset, self._needle_is_through, 1.5 * self._needle_length, 0.5)
+        offset = self._see.needle_from_tool(taking)
+        yield from self._follow_arc(taking, offset, self._see.needle_is_through, 1.5 * self._needle_length, 0.5)
         yield from self._follow_arc(taking, offset, lambda: False, 0.5, 0.5, at_end=None)
-        clear = Rigid(self._needle().position + 3.0 * self._away_from_vessels(), self._needle().quaternion)
+        clear = Rigid(self._see.needle().position + 3.0 * self._see.away_from_vessels(), self._see.needle().quaternion)
         yield from self._carry(taking, clear, offset)
 
     def _back_out(self) -> Movement:
-        tool = self._holder()
-        offset = self._needle_from_tool(tool)
-        start = self._needle()
+        tool = self._see.holder()
+        offset = self._see.needle_from_tool(tool)
+        start = self._see.needle()
         moved = 0.0
-        while self._view.holes:
+        while self._see.view.holes:
             moved -= PRESS * self._hand.speed_mm_s * self._dt
             if moved < -self._needle_length - 1.0:
-                raise _Lost("the needle does not come out")
+                raise Lost("the needle does not come out")
             self._pose[tool] = along_arc(start, moved, self._radius) @ offset
             yield
-        away = self._away_from_vessels()
-        here = self._needle()
+        away = self._see.away_from_vessels()
+        here = self._see.needle()
         yield from self._carry(tool, Rigid(here.position + 1.0 * away, here.quaternion), offset)
 
     def _pull_tail(self, step: Step) -> Movement:
-        tool = self._holder()
+        tool = self._see.holder()
         last = [s.vessel for s in self._task.step if s.kind == "drive"][-1]
-        away = self._across(last)
+        away = self._see.across(last)
         aim = 0.75 * step.at_most_mm
-        while self._view.tail_mm > aim:
+        while self._see.view.tail_mm > aim:
             self._pose[tool] = Rigid(
                 self._pose[tool].position + self._hand.speed_mm_s * self._dt * away, self._pose[tool].quaternion
             )
             yield
 
     def _approximate(self, step: Step) -> Movement:
-        thread = self._view.thread
-        if thread is None or self._view.tail_mm <= 0.0:
-            raise _Lost("there is no tail to take")
-        tool = 1 - self._holder()
+        thread = self._see.view.thread
+        if thread is None or self._see.view.tail_mm <= 0.0:
+            raise Lost("there is no tail to take")
+        tool = 1 - self._see.holder()
         link = self._task.scene.thread.link_mm if self._task.scene.thread else 1.0
-        node = len(thread) - 1 - max(1, round(0.3 * self._view.tail_mm / link))
+        node = len(thread) - 1 - max(1, round(0.3 * self._see.view.tail_mm / link))
         turned = self._pose[tool].quaternion
 
         def place() -> Rigid:
-            nodes = self._view.thread
+            nodes = self._see.view.thread
             assert nodes is not None
             return Rigid(nodes[node], turned)
 
-        yield from self._catch(tool, place, lambda: tool in self._view.thread_holders)
+        yield from self._catch(tool, place, lambda: tool in self._see.view.thread_holders)
         first = next(s.vessel for s in self._task.step if s.kind == "drive")
-        direction = self._across(first)
+        direction = self._see.across(first)
         pulled = 0.0
-        done = self._view.steps_done
-        while self._view.steps_done == done:
+        done = self._see.view.steps_done
+        while self._see.view.steps_done == done:
             stride = PRESS * self._hand.speed_mm_s * self._dt
             pulled += stride
-            if pulled > 8.0 or tool not in self._view.thread_holders:
-                raise _Lost("the ends do not come together")
+            if pulled > 8.0 or tool not in self._see.view.thread_holders:
+                raise Lost("the ends do not come together")
             self._pose[tool] = Rigid(self._pose[tool].position + stride * direction, self._pose[tool].quaternion)
             yield
 
@@ -278,9 +274,9 @@ class ScriptedHands:
         arc = needle_spec.held_at * self._needle_length if at_mm is None else at_mm
 
         def place() -> Rigid:
-            return self._grip(self._needle(), arc)
+            return self._grip(self._see.needle(), arc)
 
-        yield from self._catch(taking, place, lambda: taking in self._view.needle_holders)
+        yield from self._catch(taking, place, lambda: taking in self._see.view.needle_holders)
         yield from self._jaws(giving, 0.0)
         here = self._pose[giving]
         yield from self._glide(giving, Rigid(here.position - 2.0 * here.matrix()[:, 0], here.quaternion))
@@ -295,7 +291,7 @@ class ScriptedHands:
             yield from self._jaws(tool, 1.0)
             if caught():
                 return
-        raise _Lost("the jaws do not catch it")
+        raise Lost("the jaws do not catch it")
 
     def _grip(self, needle: Rigid, arc: float) -> Rigid:
         """Where an instrument holds the needle at ``arc``: jaws pointing at the circle's centre, across the wire."""
@@ -322,11 +318,11 @@ class ScriptedHands:
     def _carry_round(self, tool: int, target: Rigid, offset: Rigid, vessel: str) -> Movement:
         """The needle moves to ``target`` with its tip well clear of the vessels."""
         yield from self._hesitate()
-        axis = self._view.vessel_axis[vessel]
-        origin, _ = self._vessel_origin(vessel)
-        start = self._needle()
+        axis = self._see.view.vessel_axis[vessel]
+        origin, _ = self._see.vessel_origin(vessel)
+        start = self._see.needle()
         way = round_vessel(start.position, target.position, origin, axis, CLEAR_MM)
-        lengths = [float(np.linalg.norm(b - a)) for a, b in zip(way, way[1:], strict=False)]
+        lengths = [float(np.linalg.norm(b - a)) for a, b in itertools.pairwise(way)]
         total = sum(lengths) or 1.0
         done = 0.0
         for point, length in zip(way[1:], lengths, strict=True):
@@ -345,14 +341,14 @@ class ScriptedHands:
         at_end: str | None = "the needle does not go through",
     ) -> Movement:
         """Move the needle along its own circle ``until`` something is seen; past ``at_most`` mm give up."""
-        start = self._needle()
+        start = self._see.needle()
         moved = 0.0
         while not until():
             moved += pace * self._hand.speed_mm_s * self._dt
             if moved > at_most:
                 if at_end is None:
                     return
-                raise _Lost(at_end)
+                raise Lost(at_end)
             self._pose[tool] = along_arc(start, moved, self._radius) @ offset
             yield
 
@@ -389,110 +385,8 @@ class ScriptedHands:
         if self._hand.hesitation_s > 0.0:
             yield from self._wait(self._rng.exponential(self._hand.hesitation_s))
 
-    # --- what the hand sees --------------------------------------------------------------------------------------
-
     def _detour(self) -> Array:
         return self._rng.normal(0.0, 1.0, 3) * self._hand.wander_mm
 
     def _press_step(self) -> float:
         return PRESS * self._hand.speed_mm_s * self._dt
-
-    def _holder(self) -> int:
-        if not self._view.needle_holders:
-            raise _Lost("nobody holds the needle")
-        return self._view.needle_holders[0]
-
-    def _needle(self) -> Rigid:
-        if self._view.world_from_needle is None:
-            raise _Lost("there is no needle")
-        return self._view.world_from_needle
-
-    def _needle_from_tool(self, tool: int) -> Rigid:
-        return self._needle().inverse() @ self._view.poses.world_from_tool(tool)
-
-    def _hole(self, vessel: str, wall: str) -> HoleView | None:
-        """The hole of this pass: the last one made there that the needle is in."""
-        inside = [
-            h for h in self._view.holes if h.vessel == vessel and h.wall == wall and h.arc_mm <= self._needle_length
-        ]
-        return inside[-1] if inside else None
-
-    def _arc_in(self, vessel: str, wall: str) -> float:
-        hole = self._hole(vessel, wall)
-        return hole.arc_mm if hole else -math.inf
-
-    def _needle_is_through(self) -> bool:
-        return all(h.arc_mm > self._needle_length for h in self._view.holes)
-
-    def _task_vessel(self, name: str):  # type: ignore[no-untyped-def]
-        return next(v for v in self._task.scene.vessel if v.name == name)
-
-    def _aside(self, bite: float) -> float:
-        """Angle (rad) between the needle's plane and the vessel's axis that takes the needle past the other end."""
-        ends = self._task.scene.vessel
-        if len(ends) < 2:
-            return math.radians(ASIDE_DEG)
-        gap = math.dist(ends[0].cut_edge_mm, ends[1].cut_edge_mm)
-        radius = 0.5 * max(v.outer_diameter_mm for v in ends)
-        return min(math.radians(ASIDE_DEG), math.atan2(radius + CLEAR_PAST_MM, bite + gap))
-
-    def _vessel_origin(self, vessel: str) -> tuple[Array, Array]:
-        """The centre of the cut edge and a point of the wall at 12 o'clock, both as seen now."""
-        top, _ = self._view.look(vessel, 0.0, 0.0, "outer")
-        bottom, _ = self._view.look(vessel, 180.0, 0.0, "outer")
-        return 0.5 * (top + bottom), top
-
-    def _outward(self, vessel: str, point: Array) -> Array:
-        origin, _ = self._vessel_origin(vessel)
-        axis = self._view.vessel_axis[vessel]
-        out = point - origin
-        return unit(out - (out @ axis) * axis)
-
-    def _away_from_vessels(self) -> Array:
-        """From the axis of the vessels outwards, towards the needle."""
-        vessel = self._task.scene.vessel[0].name
-        return self._outward(vessel, self._needle().position)
-
-    def _across(self, vessel: str) -> Array:
-        """From a vessel's hole across the cut to the other end, rising: pulled that way a thread closes the gap."""
-        stitched = [h.point for h in self._view.holes if h.vessel == vessel and h.wall == "outer"]
-        if not stitched:
-            raise _Lost("the thread is not in the wall")
-        return unit(RISE * self._outward(vessel, stitched[-1]) - self._view.vessel_axis[vessel])
-
-    def _heading_in(self, vessel: str, normal: Array, steep: float, aside: float) -> tuple[Array, Array]:
-        """Tangent and inward direction of a needle that dives at ``steep`` rad and turns towards the cut end."""
-        level = self._level(vessel, normal, -1.0, aside)
-        s, c = math.sin(steep), math.cos(steep)
-        return c * level - s * normal, s * level + c * normal
-
-    def _heading_out(self, vessel: str, normal: Array, steep: float, aside: float) -> tuple[Array, Array]:
-        """The same for a needle that comes in by the cut end and rises at ``steep`` rad through the wall."""
-        level = self._level(vessel, normal, 1.0, aside)
-        s, c = math.sin(steep), math.cos(steep)
-        return c * level + s * normal, c * normal - s * level
-
-    def _level(self, vessel: str, normal: Array, sign: float, aside: float) -> Array:
-        """A direction in the wall's tangent plane, ``aside`` rad from the vessel's axis."""
-        axis = sign * self._view.vessel_axis[vessel]
-        along = unit(axis - (axis @ normal) * normal)
-        return math.cos(aside) * along + math.sin(aside) * cross(normal, along)
-
-
-def _steepest_from_lumen(bite: float, aside: float, radius: float, wall: float, needle: float) -> float:
-    """The steepest angle in degrees at which a needle inside a lumen can meet the wall at ``bite`` mm from its end.
-
-    The shaft must leave by the open end without touching the opposite wall: where the circle of radius ``needle``
-    through the tip reaches the cut plane, it must lie within three quarters of the lumen's radius.
-    """
-    lumen = radius - wall
-    for degrees in range(90, 20, -1):
-        steep = math.radians(degrees)
-        run = bite / math.cos(aside)
-        sine = math.sin(steep) - run / needle
-        if sine < -1.0:
-            continue
-        depth = wall + needle * (math.sqrt(1.0 - sine * sine) - math.cos(steep))
-        if math.hypot(radius - depth, run * math.sin(aside)) <= 0.75 * lumen:
-            return float(degrees)
-    return 20.0

@@ -161,7 +161,7 @@ def _nearest(p, x, triangles, weights):  # type: ignore[no-untyped-def]
 
 
 def nearest_on_surface(p: Array, x: Array, triangles: np.ndarray) -> tuple[int, Array]:
-    """The triangle of ``triangles`` (f, 3) nearest to the point ``p`` (3,) mm, and the weights (3,) of its nodes there."""
+    """The triangle of ``triangles`` (f, 3) nearest to the point ``p`` (3,) mm, and its nodes' weights (3,) there."""
     weights = np.zeros(3)
     hit, _ = _nearest(p, x, triangles, weights)
     return int(hit), weights

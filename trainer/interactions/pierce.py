@@ -177,7 +177,7 @@ def _arc_through(world: World, at: Array) -> float:
 
 
 def _side(world: World, place: Place) -> float:
-    """Positive where the needle's tip lies outwards of the triangle of ``place``, as the next crossing will judge it."""
+    """Positive where the tip lies outwards of the triangle of ``place``, as the next crossing will judge it."""
     assert world.solver is not None
     a, b, c = world.solver.x[place.nodes]
     return float((world.needle_pose.position - a) @ cross(b - a, c - a))

@@ -21,7 +21,7 @@ from trainer.interactions.world import Hole, World
 from trainer.mechanics.attachments import Cable
 from trainer.mechanics.thread import break_at, closest, follow, length_error, polyline, slide
 
-#: Thread that may creep through a grip in one movement, mm; what lacks beyond it makes the grip slip or the thread break.
+#: Thread that may creep through a grip in one movement, mm; if more lacks, the grip slips or the thread breaks.
 CREEP_MM = 0.02
 
 
@@ -76,7 +76,7 @@ def cables(held: Constraints) -> list[tuple[int, int, Cable]]:
     """The stretches of thread between two hard constraints with holes between: (first row, last row, cable)."""
     found = []
     hard = np.flatnonzero(held.hard)
-    for first, last in zip(hard[:-1], hard[1:], strict=True):
+    for first, last in itertools.pairwise(hard):
         rows = range(int(first), int(last) + 1)
         if len(rows) > 2:
             holes = [held.hole[r] for r in rows]
