@@ -7,11 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from performing import one_drive, perform
+from performing import one_drive, perform, record_of
 
 from trainer.curriculum import load_task
 from trainer.drivers.hand_motion import Tremor, along_arc, needle_pose
 from trainer.geometry import unit
+from trainer.metrics import score
 from trainer.profile import Hand
 
 # All three angles and all three bites come together, and each of the twelve hours comes once.
@@ -50,6 +51,9 @@ def test_a_whole_stitch_bites_both_ends_alike(clock: float, angle: float, bite: 
         (crossing,) = done.pierces(vessel, "outer")
         assert crossing.axial_mm == pytest.approx(bite, abs=0.01)
         assert turned_apart(crossing.clock_deg, clock) < 2.0
+    measured = {m.name: m.value for m in score(record_of(done, task), task)}
+    assert measured["entry_angle_deg"] == pytest.approx(angle, abs=1.0)
+    assert measured["bite_A_mm"] == pytest.approx(bite, abs=0.01)
     assert done.done.thread_length_error <= 1e-6
     assert 0.0 < done.done.gap_mm <= task.step[-1].at_most_mm
 

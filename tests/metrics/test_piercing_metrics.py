@@ -65,6 +65,12 @@ def test_only_the_first_crossing_of_a_pass_is_its_entry() -> None:
     assert scores(events)["entry_angle_deg"] == pytest.approx(70.0, abs=1e-9)
 
 
+def test_a_pass_that_begins_in_the_lumen_is_no_entry() -> None:
+    """The second bite of a stitch comes from inside: its angle to the inner wall is not the entry's."""
+    from_inside = pierce(20, "B", "inner", "out", angle=30.0, pass_number=2)
+    assert scores((pierce(10, angle=50.0), from_inside))["entry_angle_deg"] == pytest.approx(50.0, abs=1e-9)
+
+
 def test_exit_angle_is_that_of_the_outer_wall_of_the_second_end() -> None:
     found = scores(stitch(angle=80.0, exit_angle=65.0))
     assert found["entry_angle_deg"] == pytest.approx(80.0, abs=1e-9)

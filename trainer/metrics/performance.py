@@ -84,11 +84,14 @@ class Performance:
 
     @cached_property
     def entries(self) -> tuple[Pierce, ...]:
-        """The first crossing of each pass."""
+        """The first crossing of each pass that came from outside: of the outer wall, inwards.
+
+        A pass that begins in a lumen has no entry but an exit.
+        """
         first: dict[int, Pierce] = {}
         for p in self.crossings:
             first.setdefault(p.pass_number, p)
-        return tuple(first.values())
+        return tuple(p for p in first.values() if (p.wall, p.direction) == ("outer", "in"))
 
     @cached_property
     def wall_passes(self) -> tuple[WallPass, ...]:
