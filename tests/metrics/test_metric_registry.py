@@ -127,9 +127,7 @@ def moved(made: SessionRecord, world: Rigid) -> SessionRecord:
                 changed[field.name] = tuple((world.rotate(value) if turned else world.apply(value)).tolist())
         return dataclasses.replace(event, **changed)
 
-    return dataclasses.replace(
-        made, events=tuple(carry(e) for e in made.events), position=world.apply(made.position)
-    )
+    return dataclasses.replace(made, events=tuple(carry(e) for e in made.events), position=world.apply(made.position))
 
 
 @given(

@@ -104,9 +104,7 @@ class Performance:
             if isinstance(e, Withdraw | PullThrough):
                 key = (e.pass_number, e.body)
                 reached[key] = max(reached.get(key, 0.0), e.reached_mm)
-        return tuple(
-            WallPass(key[0], self.vessels[key[1]], tuple(ps), reached.get(key)) for key, ps in crossed.items()
-        )
+        return tuple(WallPass(key[0], self.vessels[key[1]], tuple(ps), reached.get(key)) for key, ps in crossed.items())
 
     @cached_property
     def emptied(self) -> frozenset[tuple[str, str, int]]:
