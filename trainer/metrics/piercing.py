@@ -40,13 +40,12 @@ def entry_angle(performance: Performance, _: str) -> float | None:
     """Angle of the needle to the wall as it enters, median over the entries; 90 is upright.
 
     An entry is the first crossing of a pass that comes from outside: the outer wall, towards the lumen. The
-    angle is asin|t·n|, recomputed from the logged vectors. t is
-    the tangent of the needle at its *tip*, at the interpolated instant of puncture: the chord of a 3/8
-    needle held at two thirds would be wrong by up to 45 degrees, and the next frame's tangent by what the
-    tip turns in a tick. n is the normal of the *undented* wall: the rest tangent plane carried by the best
-    rigid motion of the ring of wall between four and eight wall thicknesses around the point. The dent that
-    the tip presses before it breaks through lies inside that ring, so it does not bend the measure, while
-    a vessel that the other hand has turned takes the plane along.
+    angle is asin|t·n|, recomputed from the logged vectors. t is the tangent of the needle at its *tip*, at the
+    interpolated instant of puncture: the chord of a 3/8 needle held at two thirds would be wrong by up to 45
+    degrees, and the next frame's tangent by what the tip turns in a tick. n is the normal of the *undented* wall:
+    the rest tangent plane carried by the best rigid motion of the ring of wall between four and eight wall
+    thicknesses around the point. The dent that the tip presses before it breaks through lies inside that ring, so
+    it does not bend the measure, while a vessel that the other hand has turned takes the plane along.
     """
     angles = _entry_angles(performance)
     return median(angles) if angles else None
