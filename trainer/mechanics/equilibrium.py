@@ -19,8 +19,8 @@ from trainer.mechanics.compliance import Compliance
 from trainer.mechanics.links import LinkMesh
 from trainer.mechanics.minimise import Base, Bodies, Held, Memory, minimise, pull_points
 
-#: Secant pairs kept from one solve to the next.
-PAIRS = 12
+#: Secant pairs kept from one solve to the next: twelve take the same number of iterations in a stitch, and more time.
+PAIRS = 6
 #: A target further away than this, mm, is approached in steps of this size, so that the tissue follows its path …
 STEP_MM = 0.1
 #: … in at most so many steps in one solve; the rest of the way is left to the next.
