@@ -10,8 +10,9 @@ from performing import one_drive, perform
 
 from trainer import scene
 from trainer.curriculum import Task, load_task
-from trainer.events import Event, Grasp, Tear
-from trainer.geometry import Array, Rigid
+from trainer.drivers.scripted import ScriptedHands
+from trainer.events import Event, Grasp, Pierce, Tear
+from trainer.geometry import Array, Rigid, quaternion_multiply, slerp
 from trainer.interactions import thread_pull
 from trainer.interactions.thread_pull import stretch
 from trainer.poses import ToolPoses
@@ -125,7 +126,7 @@ def test_a_wall_pulled_too_hard_slips_or_tears_and_never_leaps() -> None:
     place, _ = s.view().look("A", 90.0, 0.2, "outer")
     go(s, LEFT, place, 0.0, 0.5)
     close(s, LEFT, 1.0)
-    events = go(s, LEFT, [*place, 0.0, 1.5, 0.0], 1.0, 0.05)
+    events = go(s, LEFT, place + np.array([0.0, 1.5, 0.0]), 1.0, 0.05)
     ends = [e for e in events if e.kind in ("slip", "tear")]
     assert len(ends) == 1
     assert s.world.jaws[LEFT].target == ""
@@ -148,6 +149,75 @@ def test_a_thread_drawn_apart_breaks_in_firm_jaws_and_slips_from_loose_ones() ->
         assert kinds(events).count(ending) == 1, (closure, kinds(events))
         assert stretch(s.world) <= 1e-6
         assert (s.outcome == "failed") == (ending == "break")
+
+
+@pytest.mark.parametrize("step_mm", [0.001, 0.02, 0.4])
+def test_a_thread_gives_way_at_the_same_place_however_fast_it_is_pulled(step_mm: float) -> None:
+    """A rigid thread between two grips does not creep: it breaks when it is straight, within one tick's movement.
+
+    Before, 4 mm of it lie between the grips; each grip may hold up to the jaws' reach away from its place.
+    """
+    s = threaded()
+    close(s, LEFT, 1.0)
+    way = at(s, RIGHT) - at(s, LEFT)
+    held = abs(s.world.jaws[LEFT].arc - s.world.jaws[RIGHT].arc)
+    go(s, RIGHT, at(s, LEFT) + way * (held - 2.0 * step_mm) / np.linalg.norm(way), 1.0, 0.01)
+    assert s.outcome == ""
+    events = go(s, RIGHT, at(s, LEFT) + way * (held + 4.0 * step_mm) / np.linalg.norm(way), 1.0, step_mm)
+    assert kinds(events).count("break") == 1
+    assert float(np.linalg.norm(at(s, RIGHT) - at(s, LEFT))) == pytest.approx(held, abs=2.1 * step_mm)
+    broken = next(e for e in events if e.kind == "break")
+    assert broken.tension_mN == broken.limit_mN == 710.0  # type: ignore[attr-defined]
+
+
+def test_the_needle_does_not_move_when_it_changes_hands() -> None:
+    """The second forceps turns in place while the first still leads; then the first lets go."""
+    s = scene.build(STITCH)
+    place = s.world.needle_pose.apply(np.array([-0.6, 0.1, 0.0]))
+    go(s, LEFT, place, 0.0, 0.5)
+    close(s, LEFT, 1.0)
+    assert len(s.view().needle_holders) == 2
+    now = s.view().poses
+    for k in range(1, 21):
+        turned = now.quaternion.copy()
+        turned[LEFT] = slerp(
+            now.quaternion[LEFT], quaternion_multiply(now.quaternion[LEFT], [0.0, 1.0, 0.0, 0.0]), k / 20
+        )
+        s.step(ToolPoses(now.position, turned, np.ones(2), np.ones(2, dtype=bool)))
+    before = s.world.needle_pose
+    for closure in (0.6, 0.4, 0.2):
+        s.step(ToolPoses(now.position, turned, np.array([1.0, closure]), np.ones(2, dtype=bool)))
+    assert s.view().needle_holders == (LEFT,)
+    assert s.world.needle_pose.position == pytest.approx(before.position, abs=1e-9)
+    assert abs(s.world.needle_pose.quaternion @ before.quaternion) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_a_stitch_without_tremor_makes_four_holes_and_leaves_none_again() -> None:
+    """In, through, in, through: friction in the holes shakes nothing loose. No slot is left over at the end."""
+    done = perform(STITCH, Hand())
+    made = [(e.body, e.wall, e.direction) for e in done.events if isinstance(e, Pierce)]
+    assert made == [("A", "outer", "in"), ("A", "inner", "in"), ("B", "inner", "out"), ("B", "outer", "out")]
+    assert not [e for e in done.events if e.kind in ("withdraw", "tear", "slip", "drop", "break", "overforce")]
+    world = done.scene.world
+    assert world.solver is not None
+    in_use = int(np.count_nonzero(np.any(world.solver.compliance.slot_weights != 0.0, axis=1)))
+    assert in_use == len(world.open_holes()) == 4
+
+
+def test_a_hole_that_tore_was_not_withdrawn_from() -> None:
+    """The needle dragged sideways out of the wall is no way to reach the step that asks to take it back out."""
+    drive = STITCH.step[0]
+    task = replace(STITCH, step=(drive, replace(drive, name="out again", kind="withdraw")))
+    s = scene.build(task)
+    hands = ScriptedHands(Hand(), STITCH, s.home, 0)
+    while s.tick < 500:  # the needle is now two millimetres through
+        seen = hands.poll(s.tick, s.view())
+        assert seen is not None
+        s.step(seen)
+    assert s.steps_done == 1
+    events = go(s, RIGHT, at(s, RIGHT) + np.array([0.0, 6.0, 0.0]), 1.0, 0.05)
+    assert "tear" in kinds(events)
+    assert s.steps_done == 1
 
 
 def test_a_broken_thread_is_two_that_both_keep_their_length() -> None:

@@ -16,7 +16,7 @@ from trainer.events import Aborted, Event, StepDone, TaskDone, TaskStarted, Trac
 from trainer.geometry import Array, Rigid, quaternion_from_axes, quaternion_from_euler_deg, slerp
 from trainer.instruments import forceps
 from trainer.instruments.needle import Needle, needle_point, needle_tangent
-from trainer.interactions import goal, grasp, holding, pierce, thread_pull
+from trainer.interactions import giving_way, goal, grasp, holding, pierce, thread_pull
 from trainer.interactions.world import Jaw, World, vector
 from trainer.mechanics.equilibrium import Equilibrium
 from trainer.mechanics.thread import ThreadModel
@@ -122,6 +122,8 @@ class Scene:
             at = [_part_way(a, b, share) for a, b in zip(starts, targets, strict=True)]
             jaws = from_closures + share * (closures - from_closures)
             self._move(at, jaws, start_s + m / movements * dt, dt / movements)
+            if world.broken:
+                break
         self._judge(start_s + dt)
         self.tick += 1
         return tuple(world.events)
@@ -177,7 +179,7 @@ class Scene:
             pierce.glide(world)
         holding.equilibrate(world, before, start_s, span_s, tool)
         pierce.follow_needle(world, end_s, tool)
-        holding.relieve(world, end_s)
+        giving_way.relieve(world, end_s)
         thread_pull.settle(world, end_s)
 
     def _lead_needle(self) -> str:
@@ -193,7 +195,7 @@ class Scene:
 
     def _judge(self, time_s: float) -> None:
         world, task = self.world, self.world.task
-        if any(e.kind == "break" for e in world.events):
+        if world.broken:
             self._end("failed", "the thread broke", time_s)
             return
         while self.steps_done < len(task.step):

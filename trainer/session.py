@@ -75,17 +75,18 @@ def run(
 def admit(seen: ToolPoses, held: ToolPoses) -> ToolPoses:
     """``seen``, where each instrument whose numbers are no pose keeps that of ``held`` and counts as not seen.
 
-    A pose is finite and its quaternion of length 1 within 1e-6, which is what the sinks and the scene rely on.
+    A pose is finite and its quaternion of length 1 within 1e-6, and a closure lies between 0 and 1, which is what the
+    sinks and the scene rely on; a closure beyond is cut off.
     """
     pose = np.isfinite(seen.position).all(axis=1) & np.isfinite(seen.closure)
     with np.errstate(invalid="ignore", over="ignore"):
         pose &= np.abs(np.sum(seen.quaternion**2, axis=1) - 1.0) < 2e-6
-    if pose.all():
+    if pose.all() and np.all((seen.closure >= 0.0) & (seen.closure <= 1.0)):
         return seen
     return ToolPoses(
         position=np.where(pose[:, None], seen.position, held.position),
         quaternion=np.where(pose[:, None], seen.quaternion, held.quaternion),
-        closure=np.where(pose, seen.closure, held.closure),
+        closure=np.clip(np.where(pose, seen.closure, held.closure), 0.0, 1.0),
         valid=seen.valid & pose,
     )
 

@@ -19,7 +19,8 @@ def reached(world: World, step: Step, used: set[int]) -> bool:
         used |= passes
         return bool(passes)
     if step.kind == "withdraw":
-        return not world.open_holes()
+        last = [h for h in world.holes if h.pass_number == world.passes]
+        return not world.open_holes() and not any(h.torn for h in last)
     threaded = [h for h in world.open_holes() if world.needle is not None and h.arc > world.needle.length]
     if step.kind == "tail":
         return len(threaded) == len(world.open_holes()) and 0.0 < tail_mm(world) <= step.at_most_mm

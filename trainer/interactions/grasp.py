@@ -53,11 +53,15 @@ def slip(world: World, tool: int, load_mN: float, limit_mN: float, time_s: float
 
 
 def let_go(world: World, jaw: Jaw) -> None:
-    """Empty the jaws."""
+    """Empty the jaws. Who else holds the needle holds it as it lies now."""
+    for other in world.jaws:
+        if other is not jaw and jaw.target == other.target == "needle":
+            other.tool_from_needle = other.pose.inverse() @ world.needle_pose
     for slot in jaw.slots:
         assert world.solver is not None
         world.solver.drop(slot)
     jaw.target, jaw.tool_from_needle, jaw.slots, jaw.points, jaw.vessel = "", None, (), np.zeros((0, 3)), -1
+    jaw.wall, jaw.lag_mm = "", 0.0
 
 
 def hold_needle(world: World, tool: int, arc: float) -> None:
@@ -125,14 +129,17 @@ def _catch_wall(world: World, tool: int, jaw: Jaw, spec: InstrumentSpec, before:
     """Grasp the nearest wall within reach, if the jaws have just become narrower than it is thick."""
     if world.tissue is None or world.solver is None:
         return
-    thick = [v.spec.wall_mm for v in world.tissue.vessels]
-    if not any(jaw_gap_mm(jaw.closure) < w <= jaw_gap_mm(before) for w in thick):
-        return
     centre = jaw.pose.position
     found: tuple[float, int, str, int, Array] | None = None
+    narrowest = jaw_gap_mm(jaw.closure)
+    if all(narrowest >= v.spec.wall_mm for v in world.tissue.vessels):
+        return
     for (vessel, wall), triangles in world.walls.items():
         triangle, weights = nearest_on_surface(centre, world.solver.x, triangles)
         distance = float(np.linalg.norm(weights @ world.solver.x[triangles[triangle]] - centre))
+        thick = world.tissue.vessels[vessel].spec.wall_mm
+        if not jaw_gap_mm(jaw.closure) < thick <= jaw_gap_mm(before):
+            continue
         if distance <= spec.reach_mm and (found is None or distance < found[0]):
             found = (distance, vessel, wall, triangle, weights)
     if found is None:
@@ -140,7 +147,7 @@ def _catch_wall(world: World, tool: int, jaw: Jaw, spec: InstrumentSpec, before:
     _, vessel, wall, triangle, weights = found
     nodes = world.walls[vessel, wall][triangle]
     corners = [place_on(world, vessel, wall, nodes, w) for w in np.eye(3)]
-    jaw.target, jaw.vessel = "wall", vessel
+    jaw.target, jaw.vessel, jaw.wall = "wall", vessel, wall
     jaw.slots = tuple(world.solver.hold(c.nodes, c.weights) for c in corners)
     jaw.points = jaw.pose.inverse().apply(world.solver.x[nodes])
     _grasped(world, tool, _body(world, jaw), 0.0, capacity_mN(world, tool), time_s)
@@ -155,6 +162,9 @@ def _grasped(world: World, tool: int, body: str, arc: float, force: float, time_
 
 
 def _dropped(world: World, target: str, time_s: float, tool: str) -> None:
+    if target == "needle" and world.needle_tool() is None and world.contact is not None and world.solver is not None:
+        world.solver.drop(world.contact.slot)  # nobody presses it any more
+        world.contact = None
     in_tissue = any(world.needle is not None and h.arc <= world.needle.length for h in world.open_holes())
     if target == "needle" and world.needle_tool() is None and not in_tissue:
         world.emit(Drop, time_s, tool, target="needle", point=vector(world.needle_pose.position))

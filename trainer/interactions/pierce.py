@@ -23,6 +23,10 @@ from trainer.interactions.world import Hole, Place, TipContact, World, vector
 SIDEWAYS = 2.0
 #: A tip that lifts off a wall and is back this soon, s, has never left it: one touch, one event (assumed).
 SAME_TOUCH_S = 0.1
+#: A hole this far ahead of the tip, mm, has slipped off it, however the wall is bent (assumed: a wire's thickness).
+SLIPPED_MM = 0.07
+#: Way through a hole over which friction develops, mm (assumed).
+FULL_DRAG_MM = 0.02
 #: Needle behind the tip, mm, up to which the wall next to its hole counts as already crossed.
 JUST_THROUGH_MM = 0.4
 
@@ -119,12 +123,11 @@ def follow_needle(world: World, time_s: float, tool: str) -> None:
         return
     length = world.needle.length
     for hole in world.open_holes():
-        hole.slid_mm = 0.0
         if hole.arc > length:
             continue
         at = world.needle_pose.inverse().apply(world.point(hole.place))
         arc = _arc_through(world, at)
-        hole.slid_mm, hole.arc = arc - hole.arc, arc
+        draw(hole, arc)
         hole.along = world.needle_pose.rotate(needle_tangent(world.needle, min(max(arc, 0.0), length)))
         # The outer wall's normal serves both walls: it is the way through.
         normal, _ = world.undented(hole.place)
@@ -134,14 +137,26 @@ def follow_needle(world: World, time_s: float, tool: str) -> None:
             "body": world.vessel_name(hole.place), "wall": hole.place.wall, "hole": hole.number,
             "pass_number": hole.pass_number, "reached_mm": hole.reached_mm,
         }  # fmt: skip
-        if arc < 0.0 and _side(world, hole.place) * (1.0 if hole.inwards else -1.0) > 0.0:
+        outside = _side(world, hole.place) * (1.0 if hole.inwards else -1.0) > 0.0
+        if (arc < 0.0 and outside) or arc < -SLIPPED_MM:
             close(world, hole)
             world.before = world.solver.x.copy()  # out of the hole as the wall lies now
             world.emit(Withdraw, time_s, tool, end="tip", **shared)
         elif arc > length:
+            hole.drawn_mm = 0.0
             world.emit(PullThrough, time_s, tool, **shared)
             if world.thread is None:
                 close(world, hole)
+
+
+def draw(hole: Hole, arc: float) -> None:
+    """What is in the hole runs on to ``arc``, and draws the tissue along until friction is fully developed.
+
+    Coulomb friction with a short elastic way before it slides (Dahl 1968): without it the force would jump from one
+    direction to the other at each tremor of the hand, and shake the wall.
+    """
+    hole.drawn_mm = min(FULL_DRAG_MM, max(-FULL_DRAG_MM, hole.drawn_mm + arc - hole.arc))
+    hole.arc = arc
 
 
 def close(world: World, hole: Hole) -> None:

@@ -16,13 +16,15 @@ import numpy as np
 from trainer.events import Break, Withdraw
 from trainer.geometry import Array, Rigid, cross, quaternion_from_axis_angle, quaternion_multiply, unit
 from trainer.instruments.needle import needle_point
-from trainer.interactions.pierce import close
+from trainer.interactions.pierce import close, draw
 from trainer.interactions.world import Hole, World
 from trainer.mechanics.attachments import Cable
 from trainer.mechanics.thread import break_at, closest, follow, length_error, polyline, slide
 
-#: Thread that may creep through a grip in one movement, mm; if more lacks, the grip slips or the thread breaks.
-CREEP_MM = 0.02
+#: Thread without holes between two grips is rigid: more than this too short, mm, and something gives way.
+RIGID_MM = 1e-6
+#: The tissue's equilibrium may lag behind a grip by this much thread, mm, before the grip loses it.
+MOST_LAG_MM = 0.5
 
 
 @dataclass(frozen=True)
@@ -36,8 +38,11 @@ class Constraints:
     grip: tuple[int, ...]  # instrument, or -1
 
 
-def constraints(world: World) -> Constraints:
-    """Swage, holes and grips as they are now."""
+def constraints(world: World, lagging: bool = True) -> Constraints:
+    """Swage, holes and grips as they are now.
+
+    ``lagging``: a grip gives, for the time being, the thread that the tissue has yet to let it have.
+    """
     assert world.thread is not None and world.needle is not None
     rows: list[tuple[float, int, Array, bool, Hole | None, int]] = []
     if needle_is_placed(world):
@@ -48,7 +53,7 @@ def constraints(world: World) -> Constraints:
             rows.append((hole.arc, 1 + order, world.point(hole.place), False, hole, -1))
     for i, jaw in enumerate(world.jaws):
         if jaw.target == "thread":
-            rows.append((jaw.arc, 1000 + i, jaw.pose.position, True, None, i))
+            rows.append((jaw.arc + lagging * jaw.lag_mm, 1000 + i, jaw.pose.position, True, None, i))
     rows.sort(key=lambda r: r[:2])
     return Constraints(
         arc=np.array([r[0] for r in rows]),
@@ -72,12 +77,21 @@ def swage(world: World) -> Array:
     return world.needle_pose.apply(needle_point(world.needle, world.needle.length))
 
 
-def cables(held: Constraints) -> list[tuple[int, int, Cable]]:
-    """The stretches of thread between two hard constraints with holes between: (first row, last row, cable)."""
-    found = []
+def runs(world: World, held: Constraints) -> list[tuple[int, int]]:
+    """The stretches of whole thread between two neighbouring hard constraints: first and last row."""
     hard = np.flatnonzero(held.hard)
-    for first, last in itertools.pairwise(hard):
-        rows = range(int(first), int(last) + 1)
+    return [
+        (int(first), int(last))
+        for first, last in itertools.pairwise(hard)
+        if np.any((world.pieces[:, 0] <= held.arc[first]) & (held.arc[last] <= world.pieces[:, 1]))
+    ]
+
+
+def cables(world: World, held: Constraints) -> list[tuple[int, int, Cable]]:
+    """The runs with holes between their ends: (first row, last row, cable)."""
+    found = []
+    for first, last in runs(world, held):
+        rows = range(first, last + 1)
         if len(rows) > 2:
             holes = [held.hole[r] for r in rows]
             # In the channel between the two holes of one wall the thread is as long as the channel is now.
@@ -94,7 +108,7 @@ def cables(held: Constraints) -> list[tuple[int, int, Cable]]:
             inside = float(np.sum(np.linalg.norm(np.diff(place, axis=0), axis=1)[channel[:-1]]))
             slots = np.array([h.slot if h is not None else -1 for h in holes], dtype=np.int64)
             length = float(held.arc[last] - held.arc[first]) - inside
-            found.append((int(first), int(last), Cable(slots, place, length, channel)))
+            found.append((first, last, Cable(slots, place, length, channel)))
     return found
 
 
@@ -104,16 +118,11 @@ def settle(world: World, time_s: float) -> None:
         return
     held = constraints(world)
     slid = slide(world.thread, held.arc, held.position, held.hard, world.pieces)
-    if np.any(slid.shortage > 0.0):
-        _creep(world, held, slid.shortage)
-        held = constraints(world)
-        slid = slide(world.thread, held.arc, held.position, held.hard, world.pieces)
     for row, hole in enumerate(held.hole):
         if hole is None:
             continue
-        hole.slid_mm = float(slid.arc[row] - hole.arc)
         hole.along = _towards_needle(held, row)
-        hole.arc = float(slid.arc[row])
+        draw(hole, float(slid.arc[row]))
         if slid.pulled_out[row]:
             close(world, hole)
             world.emit(
@@ -123,31 +132,31 @@ def settle(world: World, time_s: float) -> None:
     lay(world)
 
 
-def overdrawn(world: World) -> tuple[tuple[int, ...], float] | None:
-    """A stretch of thread that two hard constraints pull further apart than thread and tissue allow, if there is one.
+def overdrawn(world: World) -> tuple[int, int, Constraints] | None:
+    """A run that its ends pull further apart than thread and tissue give: first row, last row, constraints.
 
-    The instruments that hold it, and the arc (mm) at which it would break.
+    What a run with holes lacks is the tissue's lag behind the instruments: its last grip gives that much thread until
+    the equilibrium has caught up, unless it is too much. A run without holes is rigid.
     """
-    if world.thread is None:
-        return None
+    assert world.thread is not None
+    for jaw in world.jaws:
+        jaw.lag_mm = 0.0
     held = constraints(world)
     slid = slide(world.thread, held.arc, held.position, held.hard, world.pieces)
-    for first in np.flatnonzero(slid.shortage > CREEP_MM):
-        last = next(r for r in range(int(first) + 1, len(held.arc)) if held.hard[r])
-        gripping = [g for g in (held.grip[first], held.grip[last]) if g >= 0]
-        leader = world.needle_tool()
-        if held.grip[first] < 0 and leader is not None:
-            gripping.append(leader)
-        return tuple(gripping), 0.5 * float(held.arc[first] + held.arc[first + 1])
+    for first, last in runs(world, held):
+        lack = float(slid.shortage[first])
+        if last - first == 1:
+            if lack > RIGID_MM:
+                return first, last, held
+        elif lack > 0.0:
+            room = held.arc[last + 1] if last + 1 < len(held.arc) else world.thread.end
+            if lack > min(MOST_LAG_MM, room - held.arc[last]):
+                return first, last, held
+            world.jaws[held.grip[last]].lag_mm = lack
+    for first, last in runs(world, held):
+        if last - first == 1 and slid.shortage[first] > 0.0:  # rounding
+            world.jaws[held.grip[last]].lag_mm = float(slid.shortage[first])
     return None
-
-
-def _creep(world: World, held: Constraints, shortage: Array) -> None:
-    """A taut thread creeps through a grip by what the tissue's equilibrium has left over: micrometres."""
-    for row in np.flatnonzero(shortage > 0.0):
-        last = next(r for r in range(int(row) + 1, len(held.arc)) if held.hard[r])
-        if held.grip[last] >= 0:
-            world.jaws[held.grip[last]].arc += float(shortage[row])
 
 
 def lay(world: World) -> None:
@@ -173,6 +182,7 @@ def snap(world: World, arc: float, tension_mN: float, time_s: float) -> None:
     spec = world.task.scene.thread
     assert spec is not None
     world.pieces = break_at(world.thread, world.pieces, arc)
+    world.broken = True
     world.emit(Break, time_s, "", arc_mm=arc, tension_mN=tension_mN, limit_mN=spec.strength_mN.value)
 
 

@@ -56,9 +56,10 @@ class Hole:
     pass_number: int
     arc: float  # mm along needle and thread from the tip, of what is in the hole
     reached_mm: float = 0.0  # how far the tip got beyond the wall
-    slid_mm: float = 0.0  # how much needle or thread ran through it in the last movement, towards the tip
-    along: Array = field(default_factory=lambda: np.zeros(3))  # (3,) direction in which it ran
+    drawn_mm: float = 0.0  # how far what runs through it, towards the tip, has drawn the tissue along; bounded
+    along: Array = field(default_factory=lambda: np.zeros(3))  # (3,) direction in which it runs
     open: bool = True  # False once needle and thread have left it, or it tore
+    torn: bool = False
 
 
 @dataclass
@@ -72,8 +73,10 @@ class Jaw:
     target: str = ""  # needle, thread, wall, or nothing
     since: int = 0  # order of grasping; who holds the needle longest leads it
     arc: float = 0.0  # along needle and thread from the tip
+    lag_mm: float = 0.0  # thread that the tissue's equilibrium has yet to give to this grip
     tool_from_needle: Rigid | None = None
     vessel: int = -1
+    wall: str = ""
     slots: tuple[int, ...] = ()
     points: Array = field(default_factory=lambda: np.zeros((0, 3)))  # held wall, in the tool's frame
 
@@ -98,6 +101,7 @@ class World:
     touched: dict[tuple[int, str], float] = field(default_factory=dict)  # (vessel, wall) → time of the tip's last touch
     holes: list[Hole] = field(default_factory=list)
     passes: int = 0
+    broken: bool = False  # the thread, in this session
     before: Array = field(default_factory=lambda: np.zeros((0, 3)))  # tissue before its last movement
     tension_mN: float = 0.0  # of the thread between two grips
     tissue_force_mN: float = 0.0  # largest force of an instrument on tissue in the last movement
