@@ -25,9 +25,7 @@ from trainer.reporting.summary import curve_words
 def attempts(angles: list[float], outcome: str = "completed") -> list[SessionRecord]:
     """Sessions of one task, a day apart, each entered at an angle."""
     return [
-        record(
-            stitch(angle=a), session=f"S-{i}", outcome=outcome, started_at=f"2026-10-{i + 1:02d}T09:00:00+00:00"
-        )
+        record(stitch(angle=a), session=f"S-{i}", outcome=outcome, started_at=f"2026-10-{i + 1:02d}T09:00:00+00:00")
         for i, a in enumerate(angles)
     ]
 

@@ -88,9 +88,7 @@ def build(spec: VesselSpec) -> Vessel:
     """The vessel end that ``spec`` describes, with links of the stiffness that its Young's modulus gives."""
     axis, twelve, three = frame(unit(spec.axis))
     layers, around = spec.layers, spec.around
-    layer, hull, j = (
-        a.ravel() for a in np.meshgrid(np.arange(layers), np.arange(2), np.arange(around), indexing="ij")
-    )
+    layer, hull, j = (a.ravel() for a in np.meshgrid(np.arange(layers), np.arange(2), np.arange(around), indexing="ij"))
     axial = layer * (spec.length_mm / (layers - 1))
     clock = j * (2.0 * np.pi / around)
     radius = 0.5 * spec.outer_diameter_mm - hull * spec.wall_mm

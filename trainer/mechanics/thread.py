@@ -112,7 +112,14 @@ def slide(
     shortage = np.zeros(len(old))
     pulled_out = np.zeros(len(old), dtype=np.bool_)
     slide_kernel(
-        arcs, points, np.ascontiguousarray(hard, dtype=np.bool_), pieces, SNAP * model.link, old, shortage, pulled_out,
+        arcs,
+        points,
+        np.ascontiguousarray(hard, dtype=np.bool_),
+        pieces,
+        SNAP * model.link,
+        old,
+        shortage,
+        pulled_out,
         np.empty((5, len(old))),
     )
     return Slid(arcs, shortage, pulled_out)

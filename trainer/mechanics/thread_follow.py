@@ -41,8 +41,19 @@ def one_sided(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def follow_between(
-    x: Array, start: int, stop: int, first: float, link: float, last: float, a: Array, b: Array, ka: int, kb: int,
-    ahead: Array, back: Array, u: Array,
+    x: Array,
+    start: int,
+    stop: int,
+    first: float,
+    link: float,
+    last: float,
+    a: Array,
+    b: Array,
+    ka: int,
+    kb: int,
+    ahead: Array,
+    back: Array,
+    u: Array,
 ) -> float:
     """Nodes ``start`` .. ``stop - 1`` between the points a[ka] and b[kb]; returns the thread that is lacking, mm.
 
@@ -104,8 +115,16 @@ def follow_between(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def follow_kernel(
-    x: Array, origin: float, link: float, pieces: Array, arcs: Array, points: Array, shortage: Array, ahead: Array,
-    back: Array, u: Array,
+    x: Array,
+    origin: float,
+    link: float,
+    pieces: Array,
+    arcs: Array,
+    points: Array,
+    shortage: Array,
+    ahead: Array,
+    back: Array,
+    u: Array,
 ) -> None:
     """``thread.follow`` on plain arrays: each piece from constraint to constraint, then out to its free ends."""
     shortage[:] = 0.0
@@ -127,8 +146,19 @@ def follow_kernel(
                 start = math.floor(t_previous + SNAP) + 1
                 if stop > start:
                     shortage[previous] = follow_between(
-                        x, start, stop, (start - t_previous) * link, link, (t - stop + 1) * link, points, points,
-                        previous, k, ahead, back, u,
+                        x,
+                        start,
+                        stop,
+                        (start - t_previous) * link,
+                        link,
+                        (t - stop + 1) * link,
+                        points,
+                        points,
+                        previous,
+                        k,
+                        ahead,
+                        back,
+                        u,
                     )
                 else:
                     shortage[previous] = follow_between(
@@ -142,6 +172,14 @@ def follow_kernel(
         if previous >= 0:
             start = math.floor(t_previous + SNAP) + 1
             one_sided(
-                x, start, i1 + 1, 1, points[previous, 0], points[previous, 1], points[previous, 2],
-                (start - t_previous) * link, link, x,
+                x,
+                start,
+                i1 + 1,
+                1,
+                points[previous, 0],
+                points[previous, 1],
+                points[previous, 2],
+                (start - t_previous) * link,
+                link,
+                x,
             )

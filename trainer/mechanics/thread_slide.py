@@ -55,7 +55,13 @@ def pool(y: Array, begin: int, end: int, upper: int, values: Array, first: Array
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def slide_piece(
-    arcs: Array, points: Array, hard: NDArray[np.bool_], begin: int, end: int, tolerance: float, shortage: Array,
+    arcs: Array,
+    points: Array,
+    hard: NDArray[np.bool_],
+    begin: int,
+    end: int,
+    tolerance: float,
+    shortage: Array,
     work: Array,
 ) -> None:
     """Slide the soft ones of constraints ``begin`` .. ``end - 1``, which lie on one piece, in place."""
@@ -104,8 +110,15 @@ def slide_piece(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def slide_kernel(
-    arcs: Array, points: Array, hard: NDArray[np.bool_], pieces: Array, tolerance: float, old: Array, shortage: Array,
-    pulled_out: NDArray[np.bool_], work: Array,
+    arcs: Array,
+    points: Array,
+    hard: NDArray[np.bool_],
+    pieces: Array,
+    tolerance: float,
+    old: Array,
+    shortage: Array,
+    pulled_out: NDArray[np.bool_],
+    work: Array,
 ) -> None:
     """``thread.slide`` on plain arrays; ``arcs`` is changed in place, ``old`` holds its first values.
 

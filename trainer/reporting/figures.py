@@ -220,8 +220,6 @@ def learning_curve(curve: Curve, attempts: int) -> str:
     if curve.recent is not None and len(curve.values) > 1:
         a, b = x(curve.attempts[-3:][0] - 0.4), x(curve.attempts[-1] + 0.4)
         parts.append(line(a, y(curve.recent), b, y(curve.recent), stroke=VERMILLION, stroke_width=2.4))
-    parts += [
-        element("circle", cx=px, cy=py, r=3.4, fill=BLUE, stroke=PAPER, stroke_width=0.8) for px, py in points
-    ]
+    parts += [element("circle", cx=px, cy=py, r=3.4, fill=BLUE, stroke=PAPER, stroke_width=0.8) for px, py in points]
     parts.append(text(0.5 * (left + width), height - 8, "attempt", font_size=9, fill=GREY, text_anchor="middle"))
     return drawing(width, height, *parts, label=f"{curve.title} over attempts")

@@ -115,9 +115,7 @@ def _table(head: Sequence[tuple[str, str]], rows: Iterable[Sequence[str]], style
 
     top = "".join(cell("th", kind, escape(name)) for name, kind in head)
     kinds = [kind for _, kind in head]
-    body = "".join(
-        f"<tr>{''.join(cell('td', k, c) for k, c in zip(kinds, row, strict=True))}</tr>" for row in rows
-    )
+    body = "".join(f"<tr>{''.join(cell('td', k, c) for k, c in zip(kinds, row, strict=True))}</tr>" for row in rows)
     thead = f"<thead><tr>{top}</tr></thead>" if any(name for name, _ in head) else ""
     return f'<table class="{style}">{thead}<tbody>{body}</tbody></table>'
 
