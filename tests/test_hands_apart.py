@@ -10,8 +10,10 @@ from statistics import median
 import numpy as np
 from performing import perform, record_of
 
+from trainer import scene
 from trainer.curriculum import load_task
 from trainer.metrics import score
+from trainer.poses import ToolPoses
 from trainer.profile import load_profile
 
 SEEDS = 20
@@ -19,12 +21,15 @@ TASK = "anastomosis/single-stitch"
 
 
 def one(hand: str, seed: int) -> dict[str, float | str | None]:
-    """One session: its metrics, and how true its last event is to the scene."""
+    """One session: its metrics, and how far its last event is from what the logged poses give when simulated again."""
     task = load_task(TASK).task
     profile = load_profile(hand).profile
     assert profile.hand is not None
     done = perform(task, profile.hand, seed)
-    world, end = done.scene.world, done.done
+    again = scene.build(task)
+    for poses in done.poses:
+        again.step(ToolPoses.unpack(poses.pack()))
+    world, end = again.world, done.done
     found: dict[str, float | str | None] = {m.name: m.value for m in score(record_of(done, task), task)}
     found["outcome"] = end.outcome
     found["thread_length_error"] = end.thread_length_error

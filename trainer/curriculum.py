@@ -125,7 +125,8 @@ class SceneSpec:
 class Step:
     """One step of the goal; steps are reached in order.
 
-    ``drive``: the needle's tip has gone through both walls of ``vessel`` in ``direction``.
+    ``drive``: the needle's tip has gone through both walls of ``vessel`` in ``direction``, wherever that was: how far
+    from the mark is for the metrics to say.
     ``withdraw``: needle and thread are out of every hole, and none tore. ``tail``: the thread left before its first
     hole is at most ``at_most_mm``. ``approximate``: the edges at the stitch are at most ``at_most_mm`` apart.
     """

@@ -14,7 +14,7 @@ from trainer.geometry import Array, Rigid, quaternion_from_axis_angle
 from trainer.mechanics import banded
 from trainer.mechanics.attachments import Anchors, Cable, Loads
 from trainer.mechanics.equilibrium import MOST_STEPS, STEP_MM, Equilibrium
-from trainer.mechanics.links import blocks, forces, hessian
+from trainer.mechanics.links import blocks, forces, hessian, link_mesh
 from trainer.mechanics.minimise import CABLE_MM
 from trainer.mechanics.relaxation import breadth_first, relax
 
@@ -334,3 +334,47 @@ def test_two_runs_give_the_same_bits(tissue: Tissue) -> None:
         return state.x
 
     assert np.array_equal(run(), run())
+
+
+def test_a_body_that_is_left_in_peace_stays_at_rest_to_the_last_bit() -> None:
+    """Three vessels, of which any may be held: the others lie as they were built, and the held ones do not care."""
+    three = place((vessel("A", -2.5, -1.0), vessel("B", 0.0, 1.0), vessel("C", 2.5, 1.0)), Rigid.identity())
+    state = state_of(three)
+    slots = [hold(state, three, k, 0.0, 0.4) for k in range(3)]
+    place_of = [state.position(s) for s in slots]
+    move = np.array([0.0, 0.0, -0.05])
+    alone = state_of(three)
+    alone.solve(spring(alone, hold(alone, three, 0, 0.0, 0.4), move), tolerance_mN=1e-8)
+    for awake in ((0, 1, 2), (0, 2), (0,), (1,), (0, 2), (2,), (0, 1, 2), (0,)):
+        rest = three.mesh.rest
+        anchors = Anchors(
+            np.array([slots[k] for k in awake]),
+            np.array(
+                [rest[state.compliance.slot_nodes[slots[k]]].T @ state.compliance.slot_weights[slots[k]] for k in awake]
+            )
+            + move,
+            np.repeat(1e4 * np.eye(3)[None], len(awake), axis=0),
+        )
+        for _ in range(3):
+            state.solve(anchors, tolerance_mN=1e-8)
+        for k in range(3):
+            if k not in awake:
+                assert np.array_equal(state.x[three.nodes(k)], rest[three.nodes(k)]), (awake, k)
+        if 0 in awake:
+            # Residual 1e-8 mN against a least stiffness of about 1 mN/mm.
+            assert np.abs(state.x[three.nodes(0)] - alone.x[three.nodes(0)]).max() < 1e-7
+
+
+def test_a_body_may_begin_with_nodes_that_are_fixed(tissue: Tissue) -> None:
+    """The same vessel with its numbering turned round, clamp first: the same answer, node by node."""
+    one = place((vessel("A", 0.0, -1.0),), Rigid.identity())
+    n = len(one.mesh.rest)
+    turned = link_mesh(one.mesh.rest[::-1], (n - 1 - one.mesh.links)[:, ::-1], one.mesh.stiffness, one.mesh.fixed[::-1])
+    assert turned.fixed[0]
+    nodes, weights = wall_point(one.vessels[0], 0.0, 0.4, "outer")
+    answers = []
+    for mesh, order, at in ((one.mesh, one.orders()[0], nodes), (turned, n - 1 - one.orders()[0], n - 1 - nodes)):
+        state = Equilibrium(mesh, (np.ascontiguousarray(order, dtype=np.int32),))
+        state.solve(spring(state, state.hold(at, weights), np.array([0.0, 0.0, -0.1])), tolerance_mN=1e-8)
+        answers.append(state.x)
+    assert np.abs(answers[0] - answers[1][::-1]).max() < 1e-7  # as above

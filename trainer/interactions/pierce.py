@@ -104,7 +104,7 @@ def puncture(world: World, before: Rigid, after: Rigid, force: Array, start_s: f
     upright = unit(contact.normal + share * (normal - contact.normal))
     if all(h.arc > _needle_length(world) for h in world.open_holes()):
         world.passes += 1
-    hole = Hole(len(world.holes), contact.place, contact.slot, contact.inwards, world.passes, arc=0.0)
+    hole = Hole(len(world.holes), contact.place, contact.slot, contact.inwards, world.passes, upright, arc=0.0)
     world.holes.append(hole)
     world.contact = None
     world.emit(
@@ -129,9 +129,7 @@ def follow_needle(world: World, time_s: float, tool: str) -> None:
         arc = _arc_through(world, at)
         draw(hole, arc)
         hole.along = world.needle_pose.rotate(needle_tangent(world.needle, min(max(arc, 0.0), length)))
-        # The outer wall's normal serves both walls: it is the way through.
-        normal, _ = world.undented(hole.place)
-        beyond = (world.needle_pose.position - world.point(hole.place)) @ normal
+        beyond = (world.needle_pose.position - world.point(hole.place)) @ hole.normal
         hole.reached_mm = max(hole.reached_mm, float(-beyond if hole.inwards else beyond))
         shared = {
             "body": world.vessel_name(hole.place), "wall": hole.place.wall, "hole": hole.number,

@@ -54,6 +54,7 @@ class Hole:
     slot: int
     inwards: bool  # the way the tip went
     pass_number: int
+    normal: Array  # (3,) of the undented wall when it was pierced
     arc: float  # mm along needle and thread from the tip, of what is in the hole
     reached_mm: float = 0.0  # how far the tip got beyond the wall
     drawn_mm: float = 0.0  # how far what runs through it, towards the tip, has drawn the tissue along; bounded

@@ -29,7 +29,11 @@ class Compliance:
         stretching a link."""
         n = len(mesh.rest)
         self._mesh = mesh
-        self._first = np.array([int(o.min()) for o in orders])
+        owner = np.full(n, -1)
+        for b, order in enumerate(orders):
+            owner[order] = b
+        reaches = owner[mesh.links].max(axis=1)  # a link belongs to the body of a free node that it moves
+        self._first = np.array([int(mesh.links[reaches == b].min()) for b in range(len(orders))])
         self.nodes = [(int(o.min()), int(o.max()) + 1) for o in orders]  # rows of each body's free nodes
         body = self.body_of(mesh.links.min(axis=1))
         at = [np.flatnonzero(body == b) for b in range(len(orders))]

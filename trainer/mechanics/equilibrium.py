@@ -162,9 +162,12 @@ class Equilibrium:
         if not weights.any(axis=1).all():
             raise ValueError("a slot is used that was dropped")
         awake = sorted(set(kept.body_of(nodes[:, 0]).tolist()))
+        if [b not in awake for b in range(len(kept.nodes))] != self._at_rest:
+            self._memory.ring[1] = 0  # the pairs are of other bodies
         for b, (lo, hi) in enumerate(kept.nodes):
             if b not in awake and not self._at_rest[b]:
                 self.x[lo:hi] = self.mesh.rest[lo:hi]
+                self._memory.z[lo:hi] = 0.0  # it may lie between two that are awake
             self._at_rest[b] = b not in awake
         held = Held(
             awake=np.array(awake, dtype=np.int64),
