@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.metrics.synthetic_session import TICK_HZ, at, hold, pierce, reach, record, task_of
-from trainer.events import Event, Grasp, Pierce, Release, StepDone
+from trainer.events import Contact, Event, Grasp, Overforce, Pierce, Release, StepDone
 from trainer.geometry import Array
 from trainer.metrics import score
 from trainer.metrics.motion import runs
@@ -177,6 +177,20 @@ def test_runs_of_flags() -> None:
     flags = np.array([True, False, True, True, False])
     assert runs(flags).tolist() == [[0, 1], [2, 4]]
     assert runs(np.zeros(0, dtype=bool)).shape == (0, 2)
+
+
+def test_whoever_touched_no_wall_was_not_gentle() -> None:
+    """Holding the needle is no touch; a contact, a crossing or a grip of the wall is, and so is excess itself."""
+    place = {"axial_mm": 0.35, "clock_deg": 0.0}
+    contact = Contact(**at(10), body="A", wall="outer", direction="in", point=HOME, **place)
+    wall = Grasp(**at(10), target="wall", body="A", arc_mm=0.0, point=HOME, force_mN=3.0)
+    needle = dataclasses.replace(wall, target="needle", body="")
+    over = Overforce(**at(10), body="A", quantity="tissue_pull", value=70.0, limit=60.0, unit="mN")
+    assert scores(hold(HOME, 1.0))["overforce_count"] is None
+    assert scores(hold(HOME, 1.0), needle)["overforce_count"] is None
+    for touch in (contact, wall, pierce(10)):
+        assert scores(hold(HOME, 1.0), touch)["overforce_count"] == 0.0
+    assert scores(hold(HOME, 1.0), over)["overforce_count"] == 1.0
 
 
 def test_counts_are_those_of_the_events() -> None:

@@ -92,7 +92,12 @@ def test_the_back_walls_hole_is_no_bite() -> None:
 
 @pytest.mark.parametrize("clock", [0.0, 30.0, 359.5, 180.0])
 def test_clock_is_that_of_the_last_bite(clock: float) -> None:
-    assert scores(driven([80.0], clock_deg=clock), DRIVE)["clock_A_deg"] == clock
+    assert scores(driven([80.0], clock_deg=clock))["clock_A_deg"] == clock
+
+
+def test_a_vessel_with_several_marks_has_no_one_clock() -> None:
+    """``needle-drive`` marks 12, 2 and 10 o'clock on A."""
+    assert scores(driven([80.0], clock_deg=60.0), DRIVE)["clock_A_deg"] is None
 
 
 def test_placement_error_is_the_distance_on_the_unrolled_wall() -> None:
@@ -117,6 +122,29 @@ def test_depth_is_that_of_the_shallowest_pass() -> None:
     found = scores(events, DRIVE)
     assert found["depth_fraction"] == pytest.approx(0.4)
     assert found["partial_thickness_count"] == 1.0
+
+
+def tear(tick: int, p: Pierce) -> Tear:
+    """The hole of a crossing pulled out."""
+    return Tear(**at(tick), body=p.body, wall=p.wall, hole=p.hole, point=p.point, force_mN=160.0, limit_mN=150.0)
+
+
+def test_a_pass_that_tore_out_of_one_wall_is_partial_and_of_unknown_depth() -> None:
+    outer, inner = pierce(10), pierce(20, wall="inner")
+    found = scores((outer, tear(50, outer)), DRIVE)
+    assert found["partial_thickness_count"] == 1.0
+    assert found["depth_fraction"] is None
+    assert scores((outer, inner, tear(50, outer)), DRIVE)["partial_thickness_count"] == 0.0
+    elsewhere = pierce(30, pass_number=2)
+    assert scores((outer, elsewhere, tear(50, elsewhere)), DRIVE)["partial_thickness_count"] == 1.0
+
+
+@pytest.mark.parametrize("reference", [DRIVE, STITCH])
+@pytest.mark.parametrize("name", ["extra_holes", "back_wall_catches", "partial_thickness_count"])
+def test_without_a_crossing_there_is_nothing_to_judge(name: str, reference: str) -> None:
+    """Whoever did nothing has met no target; one crossing is enough to be judged."""
+    assert scores((), reference)[name] is None
+    assert scores((pierce(10),), reference)[name] == 0.0
 
 
 def test_a_pass_under_way_is_neither_shallow_nor_deep() -> None:
@@ -156,8 +184,14 @@ def test_a_hole_left_again_is_extra_where_thread_should_stay() -> None:
 
 def test_a_torn_hole_is_extra_where_thread_should_stay() -> None:
     entry = next(e for e in stitch() if isinstance(e, Pierce))
-    torn = Tear(**at(1500), body="A", wall="outer", hole=entry.hole, point=entry.point, force_mN=160.0, limit_mN=150.0)
-    assert scores((*stitch(), torn))["extra_holes"] == 1.0
+    assert scores((*stitch(), tear(1500, entry)))["extra_holes"] == 1.0
+
+
+def test_a_torn_hole_takes_the_place_of_one_that_may_be_left() -> None:
+    """``needle-drive`` lets three holes be left: the third may be torn, a fourth torn one is extra."""
+    torn = pierce(500, pass_number=9)
+    assert scores((*driven([80.0, 80.0]), torn, tear(520, torn)), DRIVE)["extra_holes"] == 0.0
+    assert scores((*driven([80.0, 80.0, 80.0]), torn, tear(520, torn)), DRIVE)["extra_holes"] == 1.0
 
 
 def test_a_bare_needle_pulled_through_leaves_its_hole_empty() -> None:

@@ -43,11 +43,26 @@ def test_mismatch_is_the_arc_between_the_bites(a: float, b: float) -> None:
 
 @pytest.mark.parametrize(("a", "b"), [(0.0, 20.0), (100.0, 80.0), (350.0, 10.0)])
 def test_obliquity_of_a_stitch_between_two_points_of_a_cylinder(a: float, b: float) -> None:
-    """Along the axis: bites 0.35 + 0.25 and the gap between the cuts; across: the chord 2 R sin(20° / 2)."""
+    """Along the axis: bites 0.35 + 0.25; across: the chord 2 R sin(20° / 2)."""
     across = 2.0 * 0.5 * math.sin(math.radians(10.0))
-    along = 0.35 + 0.25 + GAP_MM
+    along = 0.35 + 0.25
     found = scores(stitch(bite_a=0.35, bite_b=0.25, clock_a=a, clock_b=b))
     assert found["obliquity_deg"] == pytest.approx(math.degrees(math.atan2(across, along)))
+
+
+def test_obliquity_does_not_depend_on_where_the_ends_are_parked() -> None:
+    """A hole 0.2 mm aside with bites of 0.35 mm: atan(0.2 / 0.7) = 15.9 degrees, whatever the gap or offset.
+
+    A chord of 0.2 mm on a circle of 0.5 mm spans 2 asin(0.2) of the clock. 1e-9 for rounding.
+    """
+    task = task_of(STITCH)
+    made = record(stitch(clock_b=math.degrees(2.0 * math.asin(0.2))))
+    for place in ((0.3, 0.0, 0.0), (-0.3, 0.0, 0.0), (4.0, 0.0, 0.0), (0.5, 0.3, -0.2)):
+        b = dataclasses.replace(task.scene.vessel[1], cut_edge_mm=place)
+        scene = dataclasses.replace(task.scene, vessel=(task.scene.vessel[0], b))
+        found = {m.name: m.value for m in score(made, dataclasses.replace(task, scene=scene))}
+        assert found["obliquity_deg"] == pytest.approx(math.degrees(math.atan(0.2 / 0.7)), abs=1e-9)
+        assert found["obliquity_deg"] == pytest.approx(15.9, abs=0.05)
 
 
 def test_the_clock_runs_in_one_sense_on_both_ends() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from trainer.curriculum import Task
-from trainer.events import Break, Drop, Event, Grasp, Overforce, Slip, Tear
+from trainer.events import Break, Contact, Drop, Event, Grasp, Overforce, Pierce, Slip, Tear
 from trainer.metrics.performance import Performance
 from trainer.metrics.registry import metric, pierces
 
@@ -38,10 +38,17 @@ def wall_grasps(performance: Performance, _: str) -> float:
     return float(sum(e.target == "wall" for e in performance.events(Grasp)))
 
 
-@metric("overforce_count", "count", better="lower")
-def overforces(performance: Performance, _: str) -> float:
-    """How often a force or pressure rose above the task's limits; once per excursion."""
-    return _count(performance, Overforce)
+def _touched(event: Event) -> bool:
+    return isinstance(event, Contact | Pierce | Overforce) or (isinstance(event, Grasp) and event.target == "wall")
+
+
+@metric("overforce_count", "count", better="lower", version="2")
+def overforces(performance: Performance, _: str) -> float | None:
+    """How often a force or pressure rose above the task's limits; once per excursion.
+
+    None where neither needle nor jaws touched a wall: no touch is not a gentle one.
+    """
+    return _count(performance, Overforce) if any(map(_touched, performance.record.events)) else None
 
 
 @metric("slip_count", "count", better="lower")

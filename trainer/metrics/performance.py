@@ -31,7 +31,8 @@ class WallPass:
     number: int
     vessel: VesselSpec
     crossings: tuple[Pierce, ...]  # in order of time, at least one
-    reached_mm: float | None  # farthest advance beyond a wall; None while needle and wall are not apart again
+    reached_mm: float | None  # farthest advance beyond a wall; None where none was logged
+    over: bool  # needle and wall are apart again: drawn out, pulled through or torn out
 
     @property
     def full_thickness(self) -> bool:
@@ -40,7 +41,7 @@ class WallPass:
 
     @property
     def depth_fraction(self) -> float | None:
-        """Share of the wall's thickness that the tip reached, 0..1; None for a pass that is not over."""
+        """Share of the wall's thickness that the tip reached, 0..1; None for a pass that is not over or tore out."""
         if self.full_thickness:
             return 1.0
         if self.reached_mm is None:
@@ -104,7 +105,17 @@ class Performance:
             if isinstance(e, Withdraw | PullThrough):
                 key = (e.pass_number, e.body)
                 reached[key] = max(reached.get(key, 0.0), e.reached_mm)
-        return tuple(WallPass(key[0], self.vessels[key[1]], tuple(ps), reached.get(key)) for key, ps in crossed.items())
+        torn = {(e.body, e.wall, e.hole) for e in self.events(Tear)}
+        return tuple(
+            WallPass(
+                number=key[0],
+                vessel=self.vessels[key[1]],
+                crossings=tuple(ps),
+                reached_mm=reached.get(key),
+                over=key in reached or any((p.body, p.wall, p.hole) in torn for p in ps),
+            )
+            for key, ps in crossed.items()
+        )
 
     @cached_property
     def emptied(self) -> frozenset[tuple[str, str, int]]:

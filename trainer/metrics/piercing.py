@@ -87,11 +87,16 @@ def bite_ratio(performance: Performance, _: str) -> float | None:
     return median(ratios) if ratios else None
 
 
-@metric("clock_{vessel}_deg", "deg", pierces)
+@metric("clock_{vessel}_deg", "deg", pierces, version="2")
 def clock(performance: Performance, vessel: str) -> float | None:
-    """Clock angle of the last bite, 0..360; places of different bites have no meaningful average."""
+    """Clock angle of the last bite, 0..360; none where the task marks several angles on the vessel.
+
+    Places of different bites have no meaningful average, and the last of several says nothing about the
+    others: there the placement error judges each hole against its own mark.
+    """
+    asked = {s.clock_deg % 360.0 for s in performance.task.step if s.kind == "drive" and s.vessel == vessel}
     bites = performance.bites(vessel)
-    return bites[-1].clock_deg % 360.0 if bites else None
+    return bites[-1].clock_deg % 360.0 if bites and len(asked) <= 1 else None
 
 
 @metric("placement_error_mm", "mm", pierces, better="lower")
@@ -114,21 +119,34 @@ def depth_fraction(performance: Performance, _: str) -> float | None:
     """Share of the wall's thickness that the shallowest pass reached; 1 is all of it.
 
     The least over passes and vessels of reached depth / wall, at most 1; a pass that crossed both walls is
-    1; a pass that is still under way when the session ends is left out.
+    1; a pass that is still under way when the session ends is left out, and so is one that ended as its
+    hole tore out, whose depth is unknown.
     """
     depths = [d for w in performance.wall_passes if (d := w.depth_fraction) is not None]
     return min(depths, default=None)
 
 
-@metric("partial_thickness_count", "count", pierces, better="lower")
-def partial_thickness(performance: Performance, _: str) -> float:
-    """Passes that ended without having gone through both walls of a vessel that they entered."""
-    return float(sum(not w.full_thickness and w.reached_mm is not None for w in performance.wall_passes))
+@metric("partial_thickness_count", "count", pierces, better="lower", version="2")
+def partial_thickness(performance: Performance, _: str) -> float | None:
+    """Passes that ended without having gone through both walls of a vessel that they entered.
+
+    A pass ends when the needle is drawn out, is pulled through, or tears out of its hole: a hole that tore
+    before the other wall was crossed is of partial thickness too, though its depth is unknown. None where
+    no wall was pierced.
+    """
+    if not performance.crossings:
+        return None
+    return float(sum(not w.full_thickness and w.over for w in performance.wall_passes))
 
 
-@metric("back_wall_catches", "count", pierces, better="lower")
-def back_wall_catches(performance: Performance, _: str) -> float:
-    """Passes that crossed one vessel's wall at places more than 90 degrees of the clock apart."""
+@metric("back_wall_catches", "count", pierces, better="lower", version="2")
+def back_wall_catches(performance: Performance, _: str) -> float | None:
+    """Passes that crossed one vessel's wall at places more than 90 degrees of the clock apart.
+
+    None where no wall was pierced: who did nothing caught no back wall, but did not avoid it either.
+    """
+    if not performance.crossings:
+        return None
     return float(
         sum(
             any(abs(wrap_deg(p.clock_deg - q.clock_deg)) > 90.0 for p in w.crossings for q in w.crossings)
@@ -137,16 +155,20 @@ def back_wall_catches(performance: Performance, _: str) -> float:
     )
 
 
-@metric("extra_holes", "count", pierces, better="lower")
-def extra_holes(performance: Performance, _: str) -> float:
+@metric("extra_holes", "count", pierces, better="lower", version="2")
+def extra_holes(performance: Performance, _: str) -> float | None:
     """Holes in the outer walls beyond those that the task's steps ask for.
 
     Each ``drive`` step asks for one hole in its vessel. If a later step has the needle withdrawn, the hole
     may be left empty; otherwise thread must stay in it, and a hole that was left again is extra (a
     correction by a new hole leaves a leak). So, per vessel: holes left beyond those that may be left, plus
     holes still filled beyond those that may be filled; a hole that is asked to be left and still holds the
-    needle when the session ends is not extra.
+    needle when the session ends is not extra. A hole that tore out counts as left: it is extra where thread
+    should stay in it, and where holes may be left it takes the place of one of them. None where no wall was
+    pierced.
     """
+    if not performance.crossings:
+        return None
     steps = performance.task.step
     last_withdraw = max((i for i, s in enumerate(steps) if s.kind == "withdraw"), default=-1)
     extra = 0
