@@ -16,7 +16,7 @@ from rich.console import Console
 from tests.metrics.synthetic_session import DRIVE, performed, record, stitch
 from trainer.log.record import SessionRecord
 from trainer.metrics.learning import recent, trend
-from trainer.reporting import terminal
+from trainer.reporting import terminal, wording
 from trainer.reporting.page import progress_page
 from trainer.reporting.progress import ProgressReport, progress_report
 from trainer.reporting.summary import curve_words
@@ -114,6 +114,23 @@ def test_the_page_is_whole_for_few_and_many_attempts(n: int) -> None:
     assert "asymptote" not in page
     assert not re.search(r"""(src|href)=["'](?!#)|@import|url\(|<script""", page)
     json.dumps(dataclasses.asdict(found), allow_nan=False)
+
+
+@pytest.mark.parametrize(("width", "roomy"), [(40, False), (60, False), (80, False), (120, True)])
+def test_strips_are_shown_whole_or_not_at_all_and_no_value_is_cut(width: int, roomy: bool) -> None:
+    """A strip has 20 cells, and where there is room each target has one; a line may end between words only."""
+    console = Console(record=True, width=width, file=io.StringIO())
+    found = progress_report([performed(i, 0.3, session=f"S-{i}") for i in range(3)])
+    terminal.print_progress(found, console)
+    said = console.export_text()
+    assert "…" not in said
+    shown = re.findall("[━·●◆]+", said)
+    assert {len(s) for s in shown} <= {20}
+    assert len(shown) == (sum(r.last.has_target for r in found.tasks[0].rows) if roomy else 0)
+    joined = " ".join(said.split())
+    for r in found.tasks[0].rows:
+        assert wording.quantity(r.last.value, r.last.unit) in joined
+        assert wording.quantity(r.best, r.last.unit) in joined
 
 
 def test_the_terminal_shows_each_curve() -> None:

@@ -59,7 +59,8 @@ def test_targets_and_other_metrics_are_apart_and_complete() -> None:
 def test_the_summary_counts_what_was_met_and_names_what_was_missed() -> None:
     found = report(bite_a=0.3, bite_b=0.5, angle=60.0)
     said = session_summary(found)
-    assert said.startswith(f"{found.met} of {len(found.targets)} targets met.")
+    met = len(found.targets) - len(found.missed)
+    assert said.startswith(f"{met} of {len(found.targets)} targets met.")
     assert "entry angle 60.0° (70 to 90°)" in said
     assert "bite asymmetry 0.50 (0 to 0.25)" in said
     assert "Outside" not in session_summary(report())
@@ -98,8 +99,68 @@ def test_events_alike_are_one_line_and_late_ticks_none() -> None:
     lost = tuple(TrackingLost(**at(10 + i)) for i in range(4))
     back = TrackingBack(**at(20), lost_s=0.5)
     lines = event_lines((*late, *lost, back))
-    assert [(e.kind, e.count) for e in lines] == [("tracking_lost", 4), ("tracking_back", 1)]
+    assert [(e.kind, e.count) for e in lines] == [("tracking_lost", 4)]
     assert session_report(record(late), task_of()).overruns == 3
+
+
+def test_a_trackers_thousand_losses_are_one_line_for_each_hand() -> None:
+    """The hands alternate; 600 losses of 1/8 s and one of 0.5 s are 75.5 s. What a hand does begins a new line."""
+    flicker = [
+        e
+        for i in range(600)
+        for tool in ("left", "right")
+        for e in (TrackingLost(**at(4 * i, tool=tool)), TrackingBack(**at(4 * i + 2, 1, tool), lost_s=0.125))
+    ]
+    last = (TrackingLost(**at(2400, tool="left")), TrackingBack(**at(2450, tool="left"), lost_s=0.5))
+    again = TrackingLost(**at(2700))
+    lines = event_lines((*flicker, *last, pierce(2500), TrackingLost(**at(2600)), again))
+    assert [(e.tool, e.kind, e.count) for e in lines] == [
+        ("left", "tracking_lost", 601), ("right", "tracking_lost", 600), ("right", "pierce", 1),
+        ("right", "tracking_lost", 2),
+    ]  # fmt: skip
+    assert lines[0].text == "not seen by the device for 75.50 s in all"
+    assert lines[1].text == "not seen by the device for 75.00 s in all"
+    other = Aborted(**at(20, tool="left"), reason="")
+    once = (TrackingLost(**at(10)), other, TrackingBack(**at(30), lost_s=0.2), TrackingLost(**at(40)))
+    assert event_lines(once)[0].text == "not seen by the device for 0.20 s, then lost again"
+
+
+@pytest.mark.parametrize(("angle", "said"), [(0.0, "0°"), (359.4, "359°"), (359.6, "0°"), (29.6, "30°")])
+def test_twelve_is_never_360_degrees(angle: float, said: str) -> None:
+    assert wording.clock(angle) == said
+    made = session_report(record((pierce(10, clock_deg=angle),), reference=DRIVE), task_of(DRIVE))
+    console = Console(record=True, width=100, file=io.StringIO())
+    terminal.print_session(made, console)
+    for shown in (session_page(made), console.export_text()):
+        assert "360°" not in shown
+        assert said in shown
+
+
+def test_a_clock_metric_is_never_a_full_turn() -> None:
+    assert wording.quantity(359.96, "deg") == "0.0°"
+    assert wording.quantity(359.94, "deg") == "359.9°"
+
+
+def test_whoever_did_nothing_met_nothing() -> None:
+    found = session_report(record((), reference=DRIVE), task_of(DRIVE))
+    wanted = len(found.targets)
+    assert session_summary(found) == f"0 of {wanted} targets met, {wanted} not measured."
+    assert session_page(found).count("not measured</span>") == wanted
+
+
+@pytest.mark.parametrize("width", [40, 60, 80, 100])
+def test_no_width_cuts_a_value(width: int) -> None:
+    """Strips are whole or absent, and no cell ends in an ellipsis; words may be on two lines."""
+    console = Console(record=True, width=width, file=io.StringIO())
+    made = session_report(performed(seed=3, skill=0.3), task_of())
+    terminal.print_session(made, console)
+    said = console.export_text()
+    assert "…" not in said
+    assert max(map(len, said.partition("pierce")[0].splitlines())) <= width
+    assert {len(s) for s in re.findall("[━·●◆]+", said)} <= {20}
+    joined = " ".join(said.split())
+    for r in (*made.targets, *made.others):
+        assert wording.quantity(r.value, r.unit) in joined
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -130,7 +130,7 @@ def _dot(bite: Bite, x: float, y: float) -> str:
     fill = error_colour(bite.angle_error_deg)
     words = PAPER if is_dark(fill) else INK
     said = "–" if bite.angle_error_deg is None else f"{bite.angle_error_deg:.0f}° from upright"
-    hint = f"pass {bite.pass_number}: {bite.clock_deg:.0f}°, {bite.bite_mm:.2f} mm, {said}"
+    hint = f"pass {bite.pass_number}: {wording.clock(bite.clock_deg)}, {bite.bite_mm:.2f} mm, {said}"
     look = {} if bite.kept else {"stroke_dasharray": "1.5 1.5"}
     return element(
         "g",

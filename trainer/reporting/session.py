@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import groupby
 
 from trainer.curriculum import Task
-from trainer.events import Event, Pierce, TickOverrun
+from trainer.events import Event, Pierce, TickOverrun, TrackingBack, TrackingLost
 from trainer.log.record import Metric, SessionRecord
 from trainer.metrics import FAMILIES, definition_of, score
 from trainer.metrics.performance import Performance
@@ -94,7 +93,7 @@ class Histogram:
 
 @dataclass(frozen=True)
 class EventLine:
-    """An event, or several alike in a row."""
+    """An event, several alike in a row, or a hand's losses of sight between two things that it did."""
 
     time_s: float
     tool: str
@@ -125,10 +124,6 @@ class SessionReport:
     histogram: Histogram
     events: tuple[EventLine, ...]
     overruns: int  # ticks that took longer than their slot
-
-    @property
-    def met(self) -> int:
-        return sum(row.met is True for row in self.targets)
 
     @property
     def missed(self) -> tuple[MetricRow, ...]:
@@ -210,10 +205,40 @@ def histogram(performances: list[Performance], task: Task) -> Histogram:
 
 
 def event_lines(events: tuple[Event, ...]) -> tuple[EventLine, ...]:
-    """The events in words; those alike that follow each other are one line, late ticks are left out."""
-    shown = [(e, wording.describe(e)) for e in events if not isinstance(e, TickOverrun)]
-    lines = []
-    for (tool, kind, text), group in groupby(shown, key=lambda pair: (pair[0].tool, pair[0].kind, pair[1])):
-        alike = list(group)
-        lines.append(EventLine(alike[0][0].time_s, tool, kind, text, len(alike)))
-    return tuple(lines)
+    """The events in words, late ticks left out; those alike that follow each other are one line.
+
+    So are the losses of sight of one hand and its returns until that hand does something else, at the time of
+    the first, whatever the other hand does meanwhile: a tracker may lose a hand thousands of times a session.
+    """
+    groups: list[list[Event]] = []
+    unseen: dict[str, list[Event]] = {}  # of each hand, while it does nothing else
+    for e in events:
+        if isinstance(e, TickOverrun):
+            continue
+        if isinstance(e, TrackingLost | TrackingBack):
+            if e.tool not in unseen:
+                unseen[e.tool] = []
+                groups.append(unseen[e.tool])
+            unseen[e.tool].append(e)
+            continue
+        unseen.pop(e.tool, None)
+        if groups and _said(groups[-1][-1]) == _said(e):
+            groups[-1].append(e)
+        else:
+            groups.append([e])
+    return tuple(map(_line, groups))
+
+
+def _said(event: Event) -> tuple[str, str, str]:
+    return event.tool, event.kind, wording.describe(event)
+
+
+def _line(group: list[Event]) -> EventLine:
+    first, count = group[0], len(group)
+    tool, kind, text = _said(first)
+    sight = [e for e in group if isinstance(e, TrackingLost | TrackingBack)]
+    if sight:
+        lost = sum(isinstance(e, TrackingLost) for e in sight)
+        kind = TrackingLost.kind if lost else kind
+        text, count = wording.unseen(sight), max(lost, count - lost)
+    return EventLine(first.time_s, tool, kind, text, count)

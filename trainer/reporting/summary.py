@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from trainer.reporting import wording
 from trainer.reporting.progress import Curve, TaskProgress
-from trainer.reporting.session import SessionReport
+from trainer.reporting.session import MetricRow, SessionReport
 
 
 def session_summary(report: SessionReport) -> str:
     """How many targets were met, and which were missed."""
-    measured = sum(row.met is not None for row in report.targets)
-    first = f"{report.met} of {len(report.targets)} targets met"
-    first += "." if measured == len(report.targets) else f"; {len(report.targets) - measured} could not be measured."
+    first = f"{_met(report.targets)}."
     missed = [
         f"{r.title.lower()} {wording.quantity(r.value, r.unit)} ({wording.band(r.target_low, r.target_high, r.unit)})"
         for r in report.missed
@@ -19,12 +19,18 @@ def session_summary(report: SessionReport) -> str:
     return f"{first} Outside: {', '.join(missed)}." if missed else first
 
 
+def _met(targets: Sequence[MetricRow]) -> str:
+    """How many targets were met, and how many had nothing to judge."""
+    unmeasured = sum(row.met is None for row in targets)
+    said = f"{sum(row.met is True for row in targets)} of {len(targets)} targets met"
+    return said + (f", {unmeasured} not measured" if unmeasured else "")
+
+
 def task_summary(task: TaskProgress) -> str:
     """Attempts and how the last one stands against the targets."""
     rows = [r.last for r in task.rows if r.last.has_target]
-    met = sum(r.met is True for r in rows)
     tried = f"{len(task.attempts)} attempt{'s' if len(task.attempts) != 1 else ''}, {task.completed} completed."
-    return f"{tried} The last attempt met {met} of {len(rows)} targets."
+    return f"{tried} The last attempt: {_met(rows)}."
 
 
 def curve_words(curve: Curve) -> str:

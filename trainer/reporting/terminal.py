@@ -1,19 +1,25 @@
-"""Reports on the terminal: the same model as the page, in tables that fit 80 columns."""
+"""Reports on the terminal: the same model as the page; a narrow terminal loses figures, never a value."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 from rich import box
 from rich.console import Console
 from rich.markup import escape
+from rich.measure import Measurement
 from rich.table import Table
 
 from trainer.reporting import wording
-from trainer.reporting.progress import Curve, ProgressReport, TaskProgress
-from trainer.reporting.session import MetricRow, SessionReport
+from trainer.reporting.progress import Curve, ProgressReport, ProgressRow, TaskProgress
+from trainer.reporting.session import Bite, MetricRow, SessionReport
 from trainer.reporting.summary import curve_words, session_summary, task_summary
 
 #: Cells of a target strip.
 _CELLS = 20
+
+#: Heading of the column of strips, the one that a table can do without.
+_STRIP = "scale"
 
 
 def print_session(report: SessionReport, console: Console) -> None:
@@ -24,11 +30,14 @@ def print_session(report: SessionReport, console: Console) -> None:
         f"{report.steps_done} of {report.steps} steps, {escape(report.device)}, session {escape(report.session)}"
     )
     console.print(f"{escape(session_summary(report))}\n")
-    console.print(_targets(report.targets))
+    _print_targets(report.targets, console)
     _print_bites(report, console)
     _print_others(report.others, console)
     events = Table("time", "hand", "event", "", box=None, pad_edge=False, header_style="dim")
     events.columns[0].justify = "right"
+    events.columns[0].no_wrap = True
+    for column in events.columns[1:]:
+        column.overflow = "fold"
     for e in report.events:
         times = f" × {e.count}" if e.count > 1 else ""
         events.add_row(f"{e.time_s:.2f} s", escape(e.tool), wording.kind_word(e.kind), escape(e.text) + times)
@@ -43,7 +52,7 @@ def print_progress(report: ProgressReport, console: Console) -> None:
         console.print(f"\n[bold]{escape(task.title)}[/bold]\n{escape(task_summary(task))}")
         for curve in task.curves:
             console.print(f"  {curve.title:<18} {spark(curve)}  {escape(curve_words(curve))}")
-        console.print(_progress(task))
+        _print_progress(task, console)
     assumed = {r.last.source: r.last for t in report.tasks for r in t.rows if r.last.assumed}
     _print_notes(list(assumed.values()), console)
 
@@ -75,16 +84,42 @@ def strip(row: MetricRow) -> str:
     return "".join(cells)
 
 
-def _targets(rows: tuple[MetricRow, ...]) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    table.add_column("measure")
-    table.add_column("value", justify="right")
-    for name in ("", "target", ""):
-        table.add_column(name)
+def _print_rows(head: Sequence[tuple[str, str]], rows: Sequence[Sequence[str]], console: Console) -> None:
+    """A table, without its strips where they do not fit; line by line where it does not fit without them either.
+
+    ``head`` holds each column's heading and whether its cells stand left or right.
+    """
+    bare = [i for i, (name, _) in enumerate(head) if name != _STRIP]
+    for shown in (range(len(head)), bare):
+        table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+        for i in shown:
+            name, justify = head[i]
+            table.add_column("" if name == _STRIP else name, justify="right" if justify == "right" else "left")
+        for row in rows:
+            table.add_row(*(row[i] for i in shown))
+        if _fits(table, console):
+            console.print(table)
+            return
     for row in rows:
+        cells = [f"{head[i][0]} {row[i]}".strip() for i in bare[1:] if row[i]]
+        console.print(f"{row[0]}: {', '.join(cells)}")
+    console.print()
+
+
+def _fits(table: Table, console: Console) -> bool:
+    """Whether no cell of the table has to be cut or wrapped."""
+    unlimited = console.options.update(width=10_000)
+    return Measurement.get(console, unlimited, table).maximum <= console.width
+
+
+def _print_targets(rows: tuple[MetricRow, ...], console: Console) -> None:
+    head = (("measure", "left"), ("value", "right"), (_STRIP, "left"), ("target", "left"), ("", "left"))
+
+    def cells(row: MetricRow) -> list[str]:
         target = wording.band(row.target_low, row.target_high, row.unit)
-        table.add_row(row.title, wording.quantity(row.value, row.unit), strip(row), target, _verdict(row))
-    return table
+        return [escape(row.title), wording.quantity(row.value, row.unit), strip(row), target, _verdict(row)]
+
+    _print_rows(head, [cells(r) for r in rows], console)
 
 
 def _verdict(row: MetricRow) -> str:
@@ -96,45 +131,51 @@ def _verdict(row: MetricRow) -> str:
 def _print_bites(report: SessionReport, console: Console) -> None:
     if not report.stitch_map.bites:
         return
-    table = Table("vessel", "clock", "bite", "from upright", "pass", "", box=None, pad_edge=False, header_style="dim")
-    for column in table.columns[1:5]:
-        column.justify = "right"
-    for b in report.stitch_map.bites:
+    names = ("clock", "bite", "from upright", "pass")
+    head = (("vessel", "left"), *((name, "right") for name in names), ("", "left"))
+
+    def cells(b: Bite) -> list[str]:
         error = wording.quantity(b.angle_error_deg, "deg")
-        left = "" if b.kept else "left again"
-        table.add_row(b.vessel, f"{b.clock_deg:.0f}°", f"{b.bite_mm:.2f} mm", error, str(b.pass_number), left)
-    console.print(table)
-    console.print()
+        place = [escape(b.vessel), wording.clock(b.clock_deg), f"{b.bite_mm:.2f} mm"]
+        return [*place, error, str(b.pass_number), "" if b.kept else "left again"]
+
+    _print_rows(head, [cells(b) for b in report.stitch_map.bites], console)
 
 
 def _print_others(rows: tuple[MetricRow, ...], console: Console) -> None:
-    table = Table(box=None, pad_edge=False, show_header=False)
-    for _ in range(2):
-        table.add_column(style="dim")
-        table.add_column(justify="right")
-    cells = [(r.title, wording.quantity(r.value, r.unit)) for r in rows]
+    cells = [(escape(r.title), wording.quantity(r.value, r.unit)) for r in rows]
     half = (len(cells) + 1) // 2
-    for i in range(half):
-        right = cells[half + i] if half + i < len(cells) else ("", "")
-        table.add_row(*cells[i], *right)
+    beside = [(*cells[i], *(cells[half + i] if half + i < len(cells) else ("", ""))) for i in range(half)]
+    table = _pairs(beside, 2)
+    if not _fits(table, console):
+        table = _pairs(cells, 1)
     console.print(table)
     console.print()
 
 
-def _progress(task: TaskProgress) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    table.add_column("measure")
-    table.add_column("last", justify="right")
-    table.add_column("best", justify="right")
-    for name in ("", "target", ""):
-        table.add_column(name)
-    for row in task.rows:
+def _pairs(rows: Sequence[Sequence[str]], beside: int) -> Table:
+    """Names and values, so many pairs beside each other; only a name is ever folded."""
+    table = Table(box=None, pad_edge=False, show_header=False)
+    for _ in range(beside):
+        table.add_column(style="dim", overflow="fold")
+        table.add_column(justify="right", no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
+def _print_progress(task: TaskProgress, console: Console) -> None:
+    head = (("measure", "left"), ("last", "right"), ("best", "right"), (_STRIP, "left"), ("target", "left"),
+            ("", "left"))  # fmt: skip
+
+    def cells(row: ProgressRow) -> list[str]:
         last = row.last
         bar = strip(last) if last.has_target else ""
-        target = wording.band(last.target_low, last.target_high, last.unit) or "[dim]no target[/dim]"
+        target = wording.band(last.target_low, last.target_high, last.unit) or "[dim]none[/dim]"
         value, best = wording.quantity(last.value, last.unit), wording.quantity(row.best, last.unit)
-        table.add_row(last.title, value, best, bar, target, _verdict(last))
-    return table
+        return [escape(last.title), value, best, bar, target, _verdict(last)]
+
+    _print_rows(head, [cells(r) for r in task.rows], console)
 
 
 def _print_notes(assumed: list[MetricRow], console: Console) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from datetime import datetime
 
 from trainer.events import (
@@ -52,7 +53,13 @@ def number(value: float | None, unit: str = "") -> str:
     digits = {"deg": 1, "mm": 2, "s": 1, "mN": 1, "count": 0, "ratio": 2}.get(unit, 2)
     if unit == "mm" and abs(value) >= 100.0:
         digits = 0
-    return f"{value:.{digits}f}"
+    text = f"{value:.{digits}f}"
+    return "0.0" if (unit, text) == ("deg", "360.0") else text  # a full turn is 12 o'clock
+
+
+def clock(angle_deg: float) -> str:
+    """A clock angle in whole degrees, 0° to 359°: what rounds to a full turn is 12 o'clock."""
+    return f"{round(angle_deg) % 360}°"
 
 
 def quantity(value: float | None, unit: str) -> str:
@@ -90,11 +97,20 @@ def kind_word(kind: str) -> str:
 
 
 def _place(axial_mm: float, clock_deg: float) -> str:
-    return f"{axial_mm:.2f} mm from the cut at {clock_deg:.0f}°"
+    return f"{axial_mm:.2f} mm from the cut at {clock(clock_deg)}"
 
 
 def _held(target: str, body: str) -> str:
     return f"{target} of {body}" if body else target
+
+
+def unseen(events: Sequence[TrackingLost | TrackingBack]) -> str:
+    """How long one hand was out of the device's sight, of its losses and returns in a row."""
+    returns = [e.lost_s for e in events if isinstance(e, TrackingBack)]
+    if len(events) == 1 or not returns:
+        return describe(events[0])
+    total = f"not seen by the device for {sum(returns):.2f} s{' in all' if len(returns) > 1 else ''}"
+    return total + (", then lost again" if isinstance(events[-1], TrackingLost) else "")
 
 
 def describe(event: Event) -> str:
