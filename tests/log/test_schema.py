@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -10,8 +12,9 @@ import pytest
 from sqlite_utils import Database, Migrations
 
 from tests.log.log_samples import execute, write
-from trainer.log import schema
-from trainer.log.schema import LogError, create_log, default_db_path, migrate, new_session_id, open_log
+from trainer.log import reader, schema, seal
+from trainer.log.recovery import recover
+from trainer.log.schema import LogError, create_log, default_db_path, migrate, new_session_id, open_log, trainee_name
 
 SESSION = "20261122-013145-7f3a"
 
@@ -49,6 +52,59 @@ def test_nothing_belongs_to_a_session_or_trainee_that_does_not_exist(path: Path)
         ):
             with pytest.raises(sqlite3.IntegrityError, match="FOREIGN KEY"):
                 db.execute(sql)
+
+
+@pytest.fixture
+def read_only(path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The log, killed in mid-session, in a folder where nothing may be changed; root would not be asked."""
+    execute(path, "update sessions set status = 'running', hash = null, pid = 0, heartbeat = 0.0")
+    path.chmod(0o444)
+    path.parent.chmod(0o555)
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    yield path
+    path.parent.chmod(0o755)
+
+
+def test_a_read_only_log_is_read_and_left_alone(read_only: Path) -> None:
+    """No byte of the file changes, no file appears beside it, and nobody is declared dead in it."""
+    before = read_only.read_bytes(), sorted(read_only.parent.iterdir())
+    with open_log(read_only) as db:
+        assert recover(db) == []
+        assert [s.status for s in reader.list_sessions(db)] == ["running"]
+        assert reader.load(db, "last").header.id == SESSION
+        assert len(seal.check(db)) == 1  # only the unsealed session that the chain ends with
+        assert sorted(read_only.parent.iterdir()) == before[1]
+        with pytest.raises(sqlite3.OperationalError, match="readonly"):
+            db.execute("delete from metrics")
+    assert (read_only.read_bytes(), sorted(read_only.parent.iterdir())) == before
+
+
+def test_a_read_only_log_is_not_practised_into(read_only: Path) -> None:
+    with pytest.raises(LogError, match=r"s\.db: cannot be written; make the file and its folder writable"):
+        create_log(read_only)
+
+
+def test_a_read_only_log_that_is_being_written_is_read_whole(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What somebody else has committed lies beside the log until it is merged."""
+    with open_log(path) as writer:
+        with writer.atomic():
+            writer.execute("update sessions set reason = 'just now'")
+        assert path.with_name("s.db-wal").stat().st_size > 0
+        monkeypatch.setattr(os, "access", lambda *_: False)
+        with open_log(path) as db:
+            assert reader.summary(db, SESSION).reason == "just now"
+
+
+@pytest.mark.parametrize("name", ["Ana", "Ana María Núñez", "李小龙", "x" * 100, "O'Neill; drop table"])
+def test_a_name_is_stored_without_blanks_around_it(name: str) -> None:
+    assert trainee_name(f" {name}\t") == name
+
+
+@pytest.mark.parametrize("name", ["", " \n", "x" * 101, "a\nb", "a\x1b[0m", "a\0b", "a\u2028b", "\udce9"])
+def test_what_is_no_name_is_refused_in_one_line(name: str) -> None:
+    with pytest.raises(LogError, match="a trainee's name") as caught:
+        trainee_name(name)
+    assert str(caught.value).isprintable()
 
 
 def test_journal_is_write_ahead(path: Path) -> None:
@@ -128,6 +184,13 @@ def test_a_newer_log_is_refused(path: Path) -> None:
     for opening in (open_log, create_log, migrate):
         with pytest.raises(LogError, match="newer version"):
             opening(path)
+
+
+def test_a_log_whose_columns_lost_their_names_is_damaged(path: Path) -> None:
+    """One changed byte in the text of the schema does that."""
+    execute(path, "alter table _sqlite_migrations rename column name to nbme")
+    with pytest.raises(LogError, match=r"s\.db: damaged; restore a copy"):
+        open_log(path)
 
 
 def test_two_programs_may_make_the_log_at_once(tmp_path: Path) -> None:

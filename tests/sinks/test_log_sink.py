@@ -239,7 +239,7 @@ def test_kill_9_loses_no_event_older_than_a_fifth_of_a_second(path: Path, tmp_pa
     quoted = [
         f"'{str(p).replace(chr(39), chr(39) + chr(34) + chr(39) + chr(34) + chr(39))}'" for p in (recording, good)
     ]
-    assert f"rerun rrd optimize {quoted[0]} -o {quoted[1]}" in str(found)
+    assert f"{Path(sys.executable).parent / 'rerun'} rrd optimize {quoted[0]} -o {quoted[1]}" in str(found)
 
     write(path, NEXT)
     with open_log(path) as db:
@@ -362,6 +362,6 @@ def test_an_unwritable_folder_is_told_in_one_line() -> None:
         path.parent.chmod(0o755)
     lines = output.splitlines()
     assert [line.split(": ")[0] for line in lines] == list(map(str, places)), errors
-    assert "readonly" in lines[0]
+    assert "cannot be written" in lines[0]
     assert "unable to open" in lines[1]
     assert "Permission denied" in lines[2]

@@ -14,7 +14,7 @@ from sqlite_utils import Database
 from trainer import events
 from trainer.geometry import Array
 from trainer.log.record import Metric, SessionHeader, SessionRecord
-from trainer.log.schema import LogError, clear_errors, open_log, path_of
+from trainer.log.schema import LogError, clear_errors, open_log, path_of, trainee_name
 from trainer.poses import NUMBERS_PER_TOOL
 
 __all__ = ["Summary", "header", "list_sessions", "load", "open_log", "resolve", "stored_metrics", "summary"]
@@ -44,12 +44,13 @@ class Summary:
 
 def list_sessions(db: Database, trainee: str | None = None) -> list[Summary]:
     """All sessions, or those of one trainee, oldest first. Raises LogError for an unknown trainee."""
-    where, values = ("", []) if trainee is None else (" where trainees.name = ?", [trainee])
+    name = None if trainee is None else trainee_name(trainee)
+    where, values = ("", []) if name is None else (" where trainees.name = ?", [name])
     with clear_errors(path_of(db)):
         rows = list(db.query(f"{_JOINED}{where} order by sessions.started_at, sessions.id", values))
-        if trainee is not None and not rows:
+        if name is not None and not rows:
             known = [row["name"] for row in db.query("select name from trainees order by name")]
-            raise LogError(f"no sessions of trainee {trainee!r}; known: {', '.join(known) or 'nobody yet'}")
+            raise LogError(f"no sessions of trainee {name!r}; known: {', '.join(known) or 'nobody yet'}")
     return [_summary(row) for row in rows]
 
 

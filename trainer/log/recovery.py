@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shlex
+import shutil
 import sys
 import time
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ from pathlib import Path
 
 from sqlite_utils import Database
 
-from trainer.log.schema import STALE_S, clear_errors, path_of
+from trainer.log.schema import STALE_S, can_write, clear_errors, path_of
 from trainer.log.seal import seal
 
 INTERRUPTED = "the program stopped before the exercise ended"
@@ -31,12 +32,17 @@ class Interrupted:
         if self.recording is None or not Path(self.recording).exists():
             return kept
         good = Path(self.recording).with_suffix(".repaired.rrd")
-        repair = f"rerun rrd optimize {shlex.quote(self.recording)} -o {shlex.quote(str(good))}"
+        repair = shlex.join([_rerun(), "rrd", "optimize", self.recording, "-o", str(good)])
         return f"{kept}; its recording lacks its end, repair it with: {repair}"
 
 
 def recover(db: Database) -> list[Interrupted]:
-    """Close and seal the sessions that say they are running while nobody writes them. Raises LogError."""
+    """Close and seal the sessions that say they are running while nobody writes them. Raises LogError.
+
+    A log that may not be changed is left as it is.
+    """
+    if not can_write(path_of(db)):
+        return []
     found = []
     with clear_errors(path_of(db)):
         query = "select id, pid, heartbeat, recording from sessions where status = 'running' order by id"
@@ -60,6 +66,11 @@ def abort(db: Database, session_id: str, reason: str, heartbeat: float | None = 
         if closed:
             seal(db, session_id)
     return bool(closed)
+
+
+def _rerun() -> str:
+    """The program that belongs to this Python; its folder need not be on the user's PATH."""
+    return shutil.which("rerun", path=str(Path(sys.executable).parent)) or "rerun"
 
 
 def _alive(pid: int) -> bool:

@@ -11,6 +11,7 @@ import os
 import secrets
 import sqlite3
 import time
+import unicodedata
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -22,6 +23,7 @@ from sqlite_utils.db import Table
 
 #: A session whose writer has been silent for so long is taken for dead (the writer beats every second).
 STALE_S = 30.0
+LONGEST_NAME = 100
 
 _DAMAGED = "damaged; restore a copy made by `trainer db backup`"
 
@@ -109,12 +111,20 @@ def create_log(path: Path) -> Database:
     """The log at ``path``, made (with its folder) where there is none. Raises LogError."""
     with clear_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
+        if path.exists() and not can_write(path):
+            raise LogError(f"{path}: cannot be written; make the file and its folder writable, or name another log")
         return _connected(path, _make_tables)
+
+
+def can_write(path: Path) -> bool:
+    """Whether the log at ``path`` may be changed; SQLite also makes files beside it."""
+    return os.access(path, os.W_OK) and os.access(path.absolute().parent, os.W_OK)
 
 
 def open_log(path: Path) -> Database:
     """The existing log at ``path``, foreign keys enforced; works as a context manager.
 
+    A log that may not be changed is opened for reading only.
     Raises LogError where there is none, the file is no log, or another version of its tables is needed.
     """
     if not path.is_file():
@@ -131,6 +141,19 @@ def migrate(path: Path) -> list[str]:
         steps = [m.name for m in migrations.pending(db)]
         migrations.apply(db)
     return steps
+
+
+def trainee_name(given: str) -> str:
+    """A name as it is stored, without blanks around it. Raises LogError for what is no name."""
+    name = given.strip()
+    if not name:
+        raise LogError("a trainee's name must not be empty")
+    if len(name) > LONGEST_NAME:
+        raise LogError(f"a trainee's name has at most {LONGEST_NAME} characters, found {len(name)}")
+    for character in name:
+        if unicodedata.category(character) in {"Cc", "Cs", "Zl", "Zp"}:
+            raise LogError(f"a trainee's name must be plain text in one line, found {character!a} in it")
+    return name
 
 
 @contextmanager
@@ -166,7 +189,7 @@ def _reason(error: sqlite3.Error) -> str:
 
 def _connected(path: Path, prepare: Callable[[Database], None]) -> Database:
     """A connection on which ``prepare`` has done its work; closed again where that fails."""
-    db = Database(path)
+    db = Database(path if can_write(path) or not path.exists() else _read_only(path))
     try:
         db.conn.execute("pragma foreign_keys = on")
         db.conn.execute("pragma synchronous = normal")
@@ -175,6 +198,16 @@ def _connected(path: Path, prepare: Callable[[Database], None]) -> Database:
         db.close()
         raise
     return db
+
+
+def _read_only(path: Path) -> sqlite3.Connection:
+    """A connection that writes nothing, nor a file beside the log; what was not yet merged into the log is read too.
+
+    Without "immutable" SQLite makes the index of a write-ahead log, which it may not where the folder is read-only.
+    """
+    unmerged = path.with_name(f"{path.name}-wal")
+    whole = not unmerged.exists() or unmerged.stat().st_size == 0
+    return sqlite3.connect(f"{path.absolute().as_uri()}?{'immutable=1' if whole else 'mode=ro'}", uri=True)
 
 
 def _make_tables(db: Database) -> None:
@@ -204,7 +237,10 @@ def _write_ahead(db: Database) -> None:
 def _check_own(db: Database) -> None:
     """Raises LogError for somebody else's database and for tables that a newer program made."""
     known = {m.name for m in migrations._migrations}
-    applied = {m.name for m in migrations.applied(db)}
+    try:
+        applied = {m.name for m in migrations.applied(db)}
+    except KeyError as error:  # sqlite_utils, where a damaged file has lost a column's name
+        raise LogError(f"{path_of(db)}: {_DAMAGED}") from error
     if not applied:
         raise LogError(f"{path_of(db)}: not a log: an SQLite file of another program")
     if applied - known:
