@@ -9,12 +9,12 @@ from typing import Literal
 import pytest
 
 from trainer import config
-from trainer.config import NOT_NEGATIVE, POSITIVE, Bounds, ConfigError, Sourced
+from trainer.config import Bounds, ConfigError, Sourced
 
 
 @dataclass(frozen=True)
 class Part:
-    length_mm: float = field(metadata=POSITIVE)
+    length_mm: float = field(metadata={"bounds": Bounds(0.0, low_open=True)})
     kind: Literal["soft", "hard"] = "soft"
 
 
@@ -24,7 +24,7 @@ class Whole:
     count: int = field(metadata={"bounds": Bounds(1, 9)})
     part: tuple[Part, ...] = ()
     point: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    strength_mN: Sourced | None = field(default=None, metadata=NOT_NEGATIVE)
+    strength_mN: Sourced | None = field(default=None, metadata={"bounds": Bounds(0.0)})
     flag: bool = False
     limits: dict[str, Part] = field(default_factory=dict)
 
@@ -73,6 +73,11 @@ WRONG = [
     ('name = "x"\ncount = 10', "f.toml: 'count' must be >= 1 and <= 9, found 10"),
     (BASE + "part = [{ length_mm = 0.0 }]", "f.toml: 'part[0].length_mm' must be > 0, found 0"),
     (BASE + "part = [{ length_mm = nan }]", "f.toml: 'part[0].length_mm' must be finite, found nan"),
+    (
+        BASE + "part = [{ length_mm = 1" + "0" * 400 + " }]",
+        "f.toml: 'part[0].length_mm' must be finite, found a number of 1329 bits",
+    ),
+    ('name = "x"\ncount = 1' + "0" * 400, "f.toml: 'count' must be finite, found a number of 1329 bits"),
     (BASE + "part = [{ length_mm = inf }]", "f.toml: 'part[0].length_mm' must be finite, found inf"),
     (BASE + 'part = [{ length_mm = "2" }]', "f.toml: 'part[0].length_mm' expected a number, found str '2'"),
     (

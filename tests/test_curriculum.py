@@ -11,12 +11,13 @@ import pytest
 from trainer import curriculum
 from trainer.config import ConfigError
 from trainer.data_files import data_folder
+from trainer.metrics.registry import check_targets
 
 TASKS = [f"{family}/{name}" for family in curriculum.family_names() for name in curriculum.load_family(family).tasks]
 
 
 def test_the_shipped_curricula_are_in_order() -> None:
-    assert curriculum.check(data_folder("curricula")) == []
+    assert curriculum.check(data_folder("curricula"), check_targets) == []
 
 
 def test_every_task_file_belongs_to_its_family() -> None:
@@ -83,7 +84,14 @@ WRONG: list[tuple[str, str, str]] = [
         r"step 'through the wall of B, from inside out' names no vessel of the scene: 'C'",
     ),
     ('direction = "out"', 'direction = "up"', r"'step\[1\]\.direction' must be one of 'in', 'out', found 'up'"),
-    ("reach_mm = 0.15", "reach_mm = 0.15\nopen_at = 0.8", r"'open_at' must be less than 'close_at'"),
+    ("bite_mm = 0.35", "bite_mm = 2.5", r"'bite_mm' must not exceed the vessel's 'length_mm'"),
+    ("link_mm = 0.2", "link_mm = 0.001", r"'length_mm' must be at most 10000 times 'link_mm'"),
+    ("length_mm = 2.0", "length_mm = 1e30", r"'scene\.vessel\[0\]\.length_mm' must be >= 0\.0001 and <= 1000"),
+    ("value = 500.0", "value = 1e300", r"'scene\.vessel\[0\]\.modulus_kPa' must be >= 1e-06 and <= 1e\+09"),
+    ("value = 1.0", "value = 1e300", r"'scene\.vessel\[0\]\.puncture_outer_mN' must be > 0 and <= 1e\+06"),
+    ("home_mm = [-1.5,", "home_mm = [1e300,", r"'scene\.instrument\[0\]\.home_mm\[0\]' must be >= -100000 and <="),
+    ("axis = [-1.0, 0.0, 0.0]", "axis = [-1e-200, 0.0, 0.0]", r"'axis' must not be the zero vector"),
+    ('kind = "forceps"', 'kind = "forceps"\nopen_at = 0.8', r"'open_at' must be less than 'close_at'"),
 ]
 
 
@@ -115,20 +123,25 @@ def write_misnamed(folder: Path) -> None:
     (folder / "other.toml").write_text(curriculum.load_task("anastomosis/single-stitch").text)
 
 
+def write_unmeasured(folder: Path) -> None:
+    (folder / "single-stitch.toml").write_text(changed('"entry_angle_deg"', '"entry_angle_rad"'))
+
+
 @pytest.mark.parametrize(
     ("write", "message"),
     [
         (lambda folder: None, "holds no TOML file"),
         (write_family, "task 'a' has no file a.toml"),
         (write_misnamed, "'name' must equal the file's name, found 'single-stitch'"),
+        (write_unmeasured, "single-stitch.toml: task 'single-stitch': no metric 'entry_angle_rad', did you mean"),
     ],
 )
 def test_check_says_what_is_wrong_with_a_folder(tmp_path: Path, write: Callable[[Path], None], message: str) -> None:
     write(tmp_path)
-    problems = curriculum.check(tmp_path)
+    problems = curriculum.check(tmp_path, check_targets)
     assert len(problems) == 1
     assert message in problems[0]
 
 
 def test_check_names_a_path_that_is_not_there(tmp_path: Path) -> None:
-    assert curriculum.check(tmp_path / "x.toml") == [f"{tmp_path / 'x.toml'}: no such file"]
+    assert curriculum.check(tmp_path / "x.toml", check_targets) == [f"{tmp_path / 'x.toml'}: no such file"]

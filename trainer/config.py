@@ -52,8 +52,11 @@ class Bounds:
         return " and ".join(parts)
 
 
-POSITIVE = {"bounds": Bounds(0.0, low_open=True)}
-NOT_NEGATIVE = {"bounds": Bounds(0.0)}
+#: Bounds of numbers in any file, far outside of surgery: what lies beyond is a slip of the pen or of the unit, and
+#: would overflow in a simulation. All assumed.
+LENGTH_MM = {"bounds": Bounds(1e-4, 1000.0)}
+POSITION_MM = {"bounds": Bounds(-1e5, 1e5)}
+ANGLE_DEG = {"bounds": Bounds(-360.0, 360.0)}
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -134,7 +137,7 @@ def _convert(kind: Any, value: Any, name: str, key: str, bounds: Bounds | None) 
     if dataclasses.is_dataclass(kind):
         return build(typing.cast("type[Any]", kind), value, name, key)
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
-        value = float(value)
+        value = _as_float(value, name, key)
     if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
         raise ConfigError(f"{name}: '{key}' expected {_type_name(kind)}, found {_describe(value)}")
     if kind in (int, float):
@@ -156,8 +159,16 @@ def _sequence(arguments: tuple[Any, ...], value: Any, name: str, key: str, bound
     )
 
 
+def _as_float(value: int, name: str, key: str) -> float:
+    """TOML's whole numbers have any length here, a float has its end."""
+    try:
+        return float(value)
+    except OverflowError:
+        raise ConfigError(f"{name}: '{key}' must be finite, found a number of {value.bit_length()} bits") from None
+
+
 def _check_bounds(value: float, name: str, key: str, bounds: Bounds | None) -> None:
-    if not math.isfinite(value):
+    if not math.isfinite(_as_float(value, name, key) if isinstance(value, int) else value):
         raise ConfigError(f"{name}: '{key}' must be finite, found {value}")
     if bounds is not None and not bounds.accepts(value):
         raise ConfigError(f"{name}: '{key}' must be {bounds}, found {value:g}")

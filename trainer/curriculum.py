@@ -7,15 +7,21 @@ against which target. A component that is not named is ``None`` and costs nothin
 from __future__ import annotations
 
 import hashlib
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 from trainer import config
-from trainer.config import NOT_NEGATIVE, POSITIVE, Bounds, ConfigError, Sourced
+from trainer.config import ANGLE_DEG, LENGTH_MM, POSITION_MM, Bounds, ConfigError, Sourced
 from trainer.data_files import data_folder
 
 Vector = tuple[float, float, float]
+
+FORCE_MN = {"bounds": Bounds(0.0, 1e6, low_open=True)}
+DRAG_MN = {"bounds": Bounds(0.0, 1e6)}
+MOST_LINKS = 10_000  # assumed: a hundred times those of a stitch
 
 
 @dataclass(frozen=True)
@@ -33,24 +39,24 @@ class VesselSpec:
     """One clamped end of a vessel: a double-hulled tube (Brown 2001, section 3)."""
 
     name: str
-    cut_edge_mm: Vector  # centre of the cut plane
-    axis: Vector  # direction from the cut into the end
-    outer_diameter_mm: float = field(metadata=POSITIVE)
-    wall_mm: float = field(metadata=POSITIVE)
-    length_mm: float = field(metadata=POSITIVE)  # free length from the cut to the clamp
+    cut_edge_mm: Vector = field(metadata=POSITION_MM)  # centre of the cut plane
+    axis: Vector = field(metadata={"bounds": Bounds(-1e3, 1e3)})  # direction from the cut into the end
+    outer_diameter_mm: float = field(metadata=LENGTH_MM)
+    wall_mm: float = field(metadata=LENGTH_MM)
+    length_mm: float = field(metadata=LENGTH_MM)  # free length from the cut to the clamp
     layers: int = field(metadata={"bounds": Bounds(4, 2000)})
     around: int = field(metadata={"bounds": Bounds(8, 720)})  # nodes of a hull in one layer, even
-    modulus_kPa: Sourced = field(metadata=POSITIVE)
-    puncture_outer_mN: Sourced = field(metadata=POSITIVE)
-    puncture_inner_mN: Sourced = field(metadata=POSITIVE)
-    tear_mN: Sourced = field(metadata=POSITIVE)  # pull on a hole at which it rips out
+    modulus_kPa: Sourced = field(metadata={"bounds": Bounds(1e-6, 1e9)})
+    puncture_outer_mN: Sourced = field(metadata=FORCE_MN)
+    puncture_inner_mN: Sourced = field(metadata=FORCE_MN)
+    tear_mN: Sourced = field(metadata=FORCE_MN)  # pull on a hole at which it rips out
 
     def __post_init__(self) -> None:
         if self.wall_mm >= 0.5 * self.outer_diameter_mm:
             raise ValueError("'wall_mm' must be less than half of 'outer_diameter_mm'")
         if self.around % 2:
             raise ValueError("'around' must be even, so that the links' diagonals can alternate")
-        if not any(self.axis):
+        if math.hypot(*self.axis) < 1e-3:
             raise ValueError("'axis' must not be the zero vector")
 
 
@@ -59,10 +65,10 @@ class NeedleSpec:
     """A circular needle, rigid, at the head of the thread (Brown 2001, section 4)."""
 
     arc_deg: float = field(metadata={"bounds": Bounds(10.0, 270.0)})  # 135 is a 3/8 circle
-    length_mm: float = field(metadata=POSITIVE)  # along the arc
-    wire_mm: float = field(metadata=POSITIVE)
-    drag_mN: Sourced = field(metadata=NOT_NEGATIVE)  # friction of the wire in one hole
-    skid_deg: Sourced = field(metadata=NOT_NEGATIVE)  # flatter than this the tip glides along a wall
+    length_mm: float = field(metadata=LENGTH_MM)  # along the arc
+    wire_mm: float = field(metadata=LENGTH_MM)
+    drag_mN: Sourced = field(metadata=DRAG_MN)  # friction of the wire in one hole
+    skid_deg: Sourced = field(metadata={"bounds": Bounds(0.0, 90.0)})  # flatter than this the tip glides along a wall
     held_by: str = ""  # instrument that holds the needle when the exercise begins
     held_at: float = field(default=2 / 3, metadata={"bounds": Bounds(0.0, 1.0)})  # fraction of the arc from the tip
 
@@ -72,11 +78,15 @@ class ThreadSpec:
     """The suture behind the needle: short rigid links (Brown 2001, section 4)."""
 
     size: str  # USP size
-    length_mm: float = field(metadata=POSITIVE)
-    link_mm: float = field(metadata=POSITIVE)
-    diameter_mm: Sourced = field(metadata=POSITIVE)
-    strength_mN: Sourced = field(metadata=POSITIVE)
-    drag_mN: Sourced = field(metadata=NOT_NEGATIVE)  # friction of the thread in one hole
+    length_mm: float = field(metadata=LENGTH_MM)
+    link_mm: float = field(metadata=LENGTH_MM)
+    diameter_mm: Sourced = field(metadata=LENGTH_MM)
+    strength_mN: Sourced = field(metadata=FORCE_MN)
+    drag_mN: Sourced = field(metadata=DRAG_MN)  # friction of the thread in one hole
+
+    def __post_init__(self) -> None:
+        if self.length_mm > MOST_LINKS * self.link_mm:
+            raise ValueError(f"'length_mm' must be at most {MOST_LINKS} times 'link_mm'")
 
 
 @dataclass(frozen=True)
@@ -85,10 +95,10 @@ class InstrumentSpec:
 
     tool: Literal["left", "right"]
     kind: Literal["forceps"]
-    home_mm: Vector
-    home_rotation_deg: Vector  # about x, then y, then z of the scene
-    reach_mm: float = field(metadata=POSITIVE)  # how far from the jaws' centre a thing can be to be caught
-    grip_mN: Sourced = field(metadata=POSITIVE)  # the most the fully closed jaws hold against a pull
+    home_mm: Vector = field(metadata=POSITION_MM)
+    home_rotation_deg: Vector = field(metadata=ANGLE_DEG)  # about x, then y, then z of the scene
+    reach_mm: float = field(metadata=LENGTH_MM)  # how far from the jaws' centre a thing can be to be caught
+    grip_mN: Sourced = field(metadata=FORCE_MN)  # the most the fully closed jaws hold against a pull
     close_at: float = field(default=0.7, metadata={"bounds": Bounds(0.05, 1.0)})  # closure that grasps
     open_at: float = field(default=0.5, metadata={"bounds": Bounds(0.0, 0.95)})  # closure that lets go
 
@@ -105,8 +115,8 @@ class SceneSpec:
     vessel: tuple[VesselSpec, ...] = ()
     needle: NeedleSpec | None = None
     thread: ThreadSpec | None = None
-    position_mm: Vector = (0.0, 0.0, 0.0)
-    rotation_deg: Vector = (0.0, 0.0, 0.0)  # about x, then y, then z
+    position_mm: Vector = field(default=(0.0, 0.0, 0.0), metadata=POSITION_MM)
+    rotation_deg: Vector = field(default=(0.0, 0.0, 0.0), metadata=ANGLE_DEG)  # about x, then y, then z
 
     def __post_init__(self) -> None:
         for kind, names in (
@@ -135,16 +145,16 @@ class Step:
     kind: Literal["drive", "withdraw", "tail", "approximate"]
     vessel: str = ""
     direction: Literal["in", "out"] = "in"
-    clock_deg: float = 0.0  # the marked place
-    bite_mm: float = field(default=0.0, metadata=NOT_NEGATIVE)
-    at_most_mm: float = field(default=0.0, metadata=NOT_NEGATIVE)
+    clock_deg: float = field(default=0.0, metadata=ANGLE_DEG)  # the marked place
+    bite_mm: float = field(default=0.0, metadata={"bounds": Bounds(0.0, 1000.0)})
+    at_most_mm: float = field(default=0.0, metadata={"bounds": Bounds(0.0, 1000.0)})
 
 
 @dataclass(frozen=True)
 class Limit:
     """A force or pressure that should not be exceeded."""
 
-    value: float = field(metadata=POSITIVE)
+    value: float = field(metadata={"bounds": Bounds(0.0, 1e9, low_open=True)})
     unit: str
     source: str
 
@@ -166,7 +176,7 @@ class Task:
     name: str
     title: str
     summary: str
-    time_limit_s: float = field(metadata=POSITIVE)
+    time_limit_s: float = field(metadata={"bounds": Bounds(0.0, 86400.0, low_open=True)})
     scene: SceneSpec
     step: tuple[Step, ...]
     metric: tuple[MetricTarget, ...]
@@ -174,10 +184,12 @@ class Task:
     tick_hz: float = field(default=100.0, metadata={"bounds": Bounds(20.0, 2000.0)})
 
     def __post_init__(self) -> None:
-        vessels = {v.name for v in self.scene.vessel}
+        vessels = {v.name: v for v in self.scene.vessel}
         for s in self.step:
             if s.kind == "drive" and s.vessel not in vessels:
                 raise ValueError(f"step '{s.name}' names no vessel of the scene: {s.vessel!r}")
+            if s.kind == "drive" and s.bite_mm > vessels[s.vessel].length_mm:
+                raise ValueError(f"step '{s.name}': 'bite_mm' must not exceed the vessel's 'length_mm'")
         if not self.step:
             raise ValueError("a task needs at least one 'step'")
 
@@ -225,11 +237,14 @@ def load_family(name: str) -> Family:
     return config.build(Family, config.read_toml(path), str(path))
 
 
-def check(path: Path) -> list[str]:
-    """What is wrong with a task file, a family file or a folder of them; empty when nothing is."""
+def check(path: Path, check_task: Callable[[Task], None]) -> list[str]:
+    """What is wrong with a task file, a family file or a folder of them; empty when nothing is.
+
+    ``check_task`` raises ConfigError for a task that cannot be scored (``trainer.metrics.registry.check_targets``).
+    """
     if path.is_dir():
         files = sorted(path.rglob("*.toml"))
-        return [p for f in files for p in check(f)] if files else [f"{path}: holds no TOML file"]
+        return [p for f in files for p in check(f, check_task)] if files else [f"{path}: holds no TOML file"]
     try:
         table = config.read_toml(path)
         if path.name == "curriculum.toml":
@@ -242,6 +257,11 @@ def check(path: Path) -> list[str]:
         task = config.build(Task, table, str(path))
     except ConfigError as error:
         return [str(error)]
+    problems = []
     if task.name != path.stem:
-        return [f"{path}: 'name' must equal the file's name, found '{task.name}'"]
-    return []
+        problems.append(f"{path}: 'name' must equal the file's name, found '{task.name}'")
+    try:
+        check_task(task)
+    except ConfigError as error:
+        problems.append(f"{path}: {error}")
+    return problems

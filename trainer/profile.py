@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from trainer import config
-from trainer.config import NOT_NEGATIVE, POSITIVE, Bounds, ConfigError
+from trainer.config import ANGLE_DEG, POSITION_MM, Bounds, ConfigError
 from trainer.data_files import data_folder
 
 Vector = tuple[float, float, float]
@@ -19,16 +19,20 @@ class Hand:
     """How a scripted hand performs. ``None`` for the first three: aim where the task's steps say, at 90°."""
 
     entry_angle_deg: float | None = field(default=None, metadata={"bounds": Bounds(5.0, 90.0)})
-    bite_mm: float | None = field(default=None, metadata=POSITIVE)
-    clock_deg: float | None = None
-    entry_angle_error_deg: float = field(default=0.0, metadata=NOT_NEGATIVE)  # sd of the aimed angle
-    aim_error_mm: float = field(default=0.0, metadata=NOT_NEGATIVE)  # sd of the aimed point, each direction
-    tremor_rms_um: float = field(default=0.0, metadata=NOT_NEGATIVE)  # of the tip, three axes together
+    bite_mm: float | None = field(default=None, metadata={"bounds": Bounds(0.0, 100.0, low_open=True)})
+    clock_deg: float | None = field(default=None, metadata=ANGLE_DEG)
+    entry_angle_error_deg: float = field(default=0.0, metadata={"bounds": Bounds(0.0, 90.0)})  # sd of the aimed angle
+    aim_error_mm: float = field(
+        default=0.0, metadata={"bounds": Bounds(0.0, 5.0)}
+    )  # sd of the aimed point, each way
+    tremor_rms_um: float = field(
+        default=0.0, metadata={"bounds": Bounds(0.0, 5000.0)}
+    )  # of the tip, all axes together
     tremor_hz: float = field(default=8.0, metadata={"bounds": Bounds(1.0, 20.0)})
-    speed_mm_s: float = field(default=4.0, metadata=POSITIVE)
-    hesitation_s: float = field(default=0.0, metadata=NOT_NEGATIVE)  # mean pause before each movement
-    wander_mm: float = field(default=0.0, metadata=NOT_NEGATIVE)  # sd of detours on the way
-    seed: int = 0
+    speed_mm_s: float = field(default=4.0, metadata={"bounds": Bounds(0.01, 1000.0)})
+    hesitation_s: float = field(default=0.0, metadata={"bounds": Bounds(0.0, 60.0)})  # mean pause before each movement
+    wander_mm: float = field(default=0.0, metadata={"bounds": Bounds(0.0, 50.0)})  # sd of detours on the way
+    seed: int = field(default=0, metadata={"bounds": Bounds(0, 2**63 - 1)})
     source: str = ""  # where the numbers come from
 
 
@@ -39,8 +43,8 @@ class Sensor:
     name: str
     tool: Literal["left", "right"]
     closure: float = field(default=1.0, metadata={"bounds": Bounds(0.0, 1.0)})  # jaws, where none are recorded
-    position_mm: Vector = (0.0, 0.0, 0.0)  # sensor_from_tool
-    rotation_deg: Vector = (0.0, 0.0, 0.0)  # about x, then y, then z
+    position_mm: Vector = field(default=(0.0, 0.0, 0.0), metadata=POSITION_MM)  # sensor_from_tool
+    rotation_deg: Vector = field(default=(0.0, 0.0, 0.0), metadata=ANGLE_DEG)  # about x, then y, then z
 
 
 @dataclass(frozen=True)
@@ -49,9 +53,9 @@ class RecordingSpec:
 
     path: str = ""  # usually given by --device PATH
     sensor: tuple[Sensor, ...] = ()
-    scale: float = field(default=1.0, metadata=POSITIVE)  # of positions
-    position_mm: Vector = (0.0, 0.0, 0.0)
-    rotation_deg: Vector = (0.0, 0.0, 0.0)  # about x, then y, then z
+    scale: float = field(default=1.0, metadata={"bounds": Bounds(1e-6, 1e6)})  # of positions
+    position_mm: Vector = field(default=(0.0, 0.0, 0.0), metadata=POSITION_MM)
+    rotation_deg: Vector = field(default=(0.0, 0.0, 0.0), metadata=ANGLE_DEG)  # about x, then y, then z
     anchor: Literal["home", "none"] = "none"  # home: the first sample of a tool is where the task has it wait
 
 

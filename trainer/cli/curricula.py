@@ -58,8 +58,9 @@ def check(
 ) -> None:
     """Check files of a curriculum; exit code 1 when something is wrong."""
     from trainer import curriculum
+    from trainer.metrics.registry import check_targets
 
-    problems = curriculum.check(path)
+    problems = curriculum.check(path, check_targets)
     if as_json:
         print(json.dumps({"path": str(path), "problems": problems}, indent=2))
     elif problems:

@@ -1,0 +1,49 @@
+"""Every shipped device by existing, and what a device's file may not say."""
+
+from __future__ import annotations
+
+import pytest
+
+from trainer import profile
+from trainer.config import ConfigError
+
+HAND = 'name = "x"\ndriver = "scripted"\nsummary = "x"\n[hand]\n'
+RECORDING = 'name = "x"\ndriver = "recording"\nsummary = "x"\n[recording]\n'
+SENSOR = RECORDING + '[[recording.sensor]]\nname = "s"\ntool = "left"\n'
+
+
+@pytest.mark.parametrize("name", profile.profile_names())
+def test_a_shipped_profile_loads(name: str) -> None:
+    assert profile.load_profile(name).profile.name == name
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (HAND + "seed = -1", r"'hand\.seed' must be >= 0"),
+        (HAND + f"seed = {2**63}", r"'hand\.seed' must be >= 0 and <= "),
+        (HAND + "wander_mm = 50.1", r"'hand\.wander_mm' must be >= 0 and <= 50, found 50\.1"),
+        (HAND + "aim_error_mm = 5.1", r"'hand\.aim_error_mm' must be >= 0 and <= 5, found 5\.1"),
+        (HAND + "tremor_rms_um = 1e9", r"'hand\.tremor_rms_um' must be >= 0 and <= 5000, found 1e\+09"),
+        (HAND + "speed_mm_s = 1e-9", r"'hand\.speed_mm_s' must be >= 0\.01 and <= 1000, found 1e-09"),
+        (HAND + "speed_mm_s = 1e9", r"'hand\.speed_mm_s' must be >= 0\.01 and <= 1000, found 1e\+09"),
+        (HAND + "hesitation_s = 61", r"'hand\.hesitation_s' must be >= 0 and <= 60, found 61"),
+        (HAND + "bite_mm = 101", r"'hand\.bite_mm' must be > 0 and <= 100, found 101"),
+        (HAND + "clock_deg = 361", r"'hand\.clock_deg' must be >= -360 and <= 360, found 361"),
+        (HAND + "entry_angle_error_deg = 91", r"'hand\.entry_angle_error_deg' must be >= 0 and <= 90, found 91"),
+        (RECORDING + "scale = 1e-7", r"'recording\.scale' must be >= 1e-06 and <= 1e\+06, found 1e-07"),
+        (RECORDING + "position_mm = [0, 1e300, 0]", r"'recording\.position_mm\[1\]' must be >= -100000 and <= 100000"),
+        (SENSOR + "position_mm = [0, 0, -1e6]", r"'recording\.sensor\[0\]\.position_mm\[2\]' must be >= -100000"),
+        (SENSOR + "rotation_deg = [0, 0, 1e6]", r"'recording\.sensor\[0\]\.rotation_deg\[2\]' must be >= -360"),
+    ],
+)
+def test_a_number_that_no_device_has_is_refused_in_one_line(text: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=f"^d\\.toml: {message}") as caught:
+        profile.parse_profile(text, "d.toml")
+    assert "\n" not in str(caught.value)
+
+
+def test_the_largest_seed_is_taken() -> None:
+    hand = profile.parse_profile(HAND + f"seed = {2**63 - 1}", "d.toml").hand
+    assert hand is not None
+    assert hand.seed == 2**63 - 1
