@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from contextlib import closing
 from pathlib import Path
@@ -20,6 +21,7 @@ from trainer.sinks.log import LogSink
 from trainer.sinks.surface import Frame, TickRecord
 
 RUNNER = CliRunner()
+FULL = Path("/dev/full")
 
 
 def no_frame() -> Frame:
@@ -62,6 +64,13 @@ def test_a_page_is_written_and_stdout_stays_clean(log: Path, tmp_path: Path) -> 
     assert result.stdout == ""
     assert str(page) in result.stderr.replace("\n", "")
     assert page.read_text(encoding="utf-8").startswith("<!doctype html>")
+
+
+@pytest.mark.skipif(not FULL.exists(), reason="no disk that is always full")
+def test_a_full_disk_is_told_with_the_name_of_the_file(log: Path) -> None:
+    result = RUNNER.invoke(report.app, ["session", "last", "--db", str(log), "--html", str(FULL)])
+    assert isinstance(result.exception, OSError)
+    assert (result.exception.errno, result.exception.filename) == (errno.ENOSPC, str(FULL))
 
 
 def test_progress_is_that_of_one_trainee(log: Path, tmp_path: Path) -> None:

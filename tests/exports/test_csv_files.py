@@ -11,8 +11,11 @@ import pytest
 
 from tests.metrics.synthetic_session import DRIVE, performed, record, task_of
 from trainer.events import from_row
+from trainer.exports import csv_files
 from trainer.exports.csv_files import FILES, ExportError, write
 from trainer.metrics import score
+
+FULL = Path("/dev/full")
 
 
 def rows(path: Path) -> list[dict[str, str]]:
@@ -80,6 +83,16 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["notes.txt"]
     with pytest.raises(ExportError, match="is a file"):
         write([record()], tmp_path / "notes.txt")
+
+
+@pytest.mark.skipif(not FULL.exists(), reason="no disk that is always full")
+def test_a_full_disk_is_told_with_the_name_of_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whether the rows do not fit or what is left of them when the file is closed."""
+    monkeypatch.setattr(csv_files, "FILES", {str(FULL): FILES["poses.csv"]})
+    for many in (1, 50):
+        with pytest.raises(OSError, match="No space left") as caught:
+            write([performed(i, 0.5) for i in range(2)] * many, tmp_path / f"out {many}")
+        assert caught.value.filename == str(FULL)
 
 
 def test_an_empty_folder_may_be_filled(tmp_path: Path) -> None:

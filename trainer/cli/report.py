@@ -74,5 +74,9 @@ def progress(
 
 def write_page(path: Path, page: str) -> None:
     """Write a page and tell where it is, on stderr. Raises OSError."""
-    path.write_text(page, encoding="utf-8")
+    try:
+        path.write_text(page, encoding="utf-8")
+    except OSError as error:
+        error.filename = str(path)  # a full disk names no file
+        raise
     typer.echo(f"wrote {path}", err=True)

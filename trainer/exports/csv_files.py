@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from trainer.curriculum import parse_task
 from trainer.events import payload
@@ -85,17 +86,32 @@ def write(records: Iterable[SessionRecord], folder: Path) -> dict[str, int]:
         raise ExportError(f"{folder}: is not empty; nothing is overwritten, name a new folder with --out")
     folder.mkdir(parents=True, exist_ok=True)
     rows = dict.fromkeys(FILES, 0)
-    files = {name: (folder / name).open("w", encoding="utf-8", newline="") for name in FILES}
-    try:
-        writers = {name: csv.writer(file, lineterminator="\n") for name, file in files.items()}
+    with ExitStack() as stack:
+        writers = {}
         for name, (columns, _) in FILES.items():
+            file = (folder / name).open("w", encoding="utf-8", newline="")
+            stack.callback(_close, file, folder / name)
+            writers[name] = csv.writer(file, lineterminator="\n")
             writers[name].writerow(columns)
         for record in records:
             for name, (_, rows_of) in FILES.items():
-                for row in rows_of(record):
-                    writers[name].writerow(row)
-                    rows[name] += 1
-    finally:
-        for file in files.values():
-            file.close()
+                with _naming(folder / name):
+                    for row in rows_of(record):
+                        writers[name].writerow(row)
+                        rows[name] += 1
     return rows
+
+
+def _close(file: TextIO, path: Path) -> None:
+    with _naming(path):
+        file.close()
+
+
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Have an error name the file: a full disk names none."""
+    try:
+        yield
+    except OSError as error:
+        error.filename = str(path)
+        raise
