@@ -87,7 +87,7 @@ ERRORS = [
 
 
 def raising(error: BaseException, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(path: Path) -> list[str]:
+    def fail(path: Path, check_task: object) -> list[str]:
         raise error
 
     monkeypatch.setattr("trainer.curriculum.check", fail)
@@ -134,6 +134,37 @@ def test_kernels_are_kept_where_the_user_said(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.delenv("NUMBA_CACHE_DIR")
     command_line_module.keep_kernels()
     assert Path(os.environ["NUMBA_CACHE_DIR"]).name == "kernels"
+
+
+def test_kernels_are_kept_in_a_private_folder_where_there_is_no_home(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A home that is a file cannot hold a cache, for root neither. A folder that others can write to is not used."""
+    (tmp_path / "home").touch()
+    (tmp_path / "tmp").mkdir()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home" / "cache"))
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "tmp"))
+    expected = tmp_path / "tmp" / f"trainer-kernels-{os.getuid()}"
+    kept = []
+    for mode in (0o700, 0o700, 0o777):
+        monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+        if expected.exists():
+            expected.chmod(mode)
+        command_line_module.keep_kernels()
+        kept.append(Path(os.environ["NUMBA_CACHE_DIR"]))
+    assert kept[0] == kept[1] == expected
+    assert kept[2] != expected
+    assert kept[2].parent == tmp_path / "tmp"
+    assert kept[2].stat().st_mode & 0o777 == 0o700
+
+
+@pytest.mark.parametrize("arguments", [["--version"], ["--help"], ["curricula", "list"]])
+def test_output_that_nobody_wants_is_no_error(arguments: list[str]) -> None:
+    """``>&-``: there is no stdout from the start."""
+    command = ["sh", "-c", 'exec "$@" >&-', "sh", sys.executable, "-m", "trainer", *arguments]
+    done = subprocess.run(command, cwd=ROOT, stderr=subprocess.PIPE, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def shown_commands() -> list[list[str]]:

@@ -6,7 +6,9 @@ Nothing heavy is imported here: the commands import what they need when they run
 from __future__ import annotations
 
 import os
+import stat
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -18,6 +20,7 @@ INTERRUPTED = 130
 
 def main() -> None:
     """Run the command line; exit code 0 done, 1 failed with a line on stderr, 2 wrong usage."""
+    _open_closed_streams()
     try:
         try:
             _run()
@@ -49,15 +52,52 @@ def _run() -> None:
         raise
 
 
+def _open_closed_streams() -> None:
+    """Give what the caller has closed (``>&-``) to nobody, before a file takes its number and hears what we print."""
+    for name in ("stdin", "stdout", "stderr"):
+        if getattr(sys, name) is None:
+            number = os.open(os.devnull, os.O_RDWR)
+            setattr(sys, name, os.fdopen(number, "r" if name == "stdin" else "w"))
+
+
 def keep_kernels() -> None:
     """Have numba keep compiled kernels in the user's cache, unless NUMBA_CACHE_DIR already says where.
 
-    The folder of an installed package may not be writable. Must run before numba is imported.
+    The folder of an installed package may not be writable; where the user's cache is not either, a temporary
+    folder serves. Must run before numba is imported.
     """
     if "NUMBA_CACHE_DIR" not in os.environ:
         from platformdirs import user_cache_path
 
-        os.environ["NUMBA_CACHE_DIR"] = str(user_cache_path("trainer") / "kernels")
+        folder = user_cache_path("trainer") / "kernels"
+        os.environ["NUMBA_CACHE_DIR"] = str(folder if _can_keep(folder) else _temporary_folder())
+
+
+def _can_keep(folder: Path) -> bool:
+    """Whether files can be made in a folder; without a home its path is not even absolute."""
+    if not folder.is_absolute():
+        return False
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return False
+    return os.access(folder, os.W_OK | os.X_OK)
+
+
+def _temporary_folder() -> Path:
+    """A folder that is this user's alone: whoever can write there decides what numba runs."""
+    import tempfile
+
+    if sys.platform == "win32":  # where the temporary files are the user's own
+        return Path(tempfile.gettempdir()) / "trainer-kernels"
+    folder = Path(tempfile.gettempdir()) / f"trainer-kernels-{os.getuid()}"
+    try:
+        folder.mkdir(mode=0o700)
+    except FileExistsError:
+        found = folder.lstat()
+        if (found.st_uid, found.st_mode) != (os.getuid(), stat.S_IFDIR | 0o700):
+            return Path(tempfile.mkdtemp(prefix="trainer-kernels-"))
+    return folder
 
 
 def build_app() -> typer.Typer:
