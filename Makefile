@@ -15,6 +15,7 @@ demo: $(INSTALLED)
 	@echo
 	@echo "Log:       $(DEMO_DB)    (.venv/bin/trainer sessions list --db $(DEMO_DB))"
 	@echo "Recording: $(DEMO_RRD)    (.venv/bin/rerun $(DEMO_RRD))"
+	@echo "rerun sends usage statistics to its makers unless told not to: .venv/bin/rerun analytics disable"
 
 test: lint
 	$(BIN)/python -m pytest -q -n auto

@@ -15,7 +15,10 @@ app = typer.Typer(help="The log itself.", no_args_is_help=True)
 
 @app.command()
 def check(db: DbOption = None, as_json: JsonOption = False) -> None:
-    """Compare every session with its seal; exit code 1 when one was changed, removed or damaged."""
+    """Compare every session with its seal; exit code 1 when one was changed, removed or damaged.
+
+    The names of people are outside the seals, so that a name can be changed or erased.
+    """
     from trainer.log import seal
     from trainer.log.schema import default_db_path, open_log
 
