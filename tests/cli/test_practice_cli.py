@@ -53,7 +53,7 @@ def task(tmp_path: Path) -> Path:
 
 def test_the_document_says_all_that_the_contract_asks(command_line: CommandLine, task: Path, tmp_path: Path) -> None:
     db = tmp_path / "new folder" / "log.db"
-    code, out, err = command_line("practice", task, "--fast", "--trainee", "Ada", "--seed", "3", "--db", db, "--json")
+    code, out, err = command_line("practice", task, "--fast", "--trainee", " Ada ", "--seed", "3", "--db", db, "--json")
     assert (code, err) == (0, "")
     found = json.loads(out, parse_constant=lambda name: pytest.fail(f"{name} in the document"))
     assert found["task"] == str(task)
@@ -90,7 +90,7 @@ def test_what_is_printed_is_what_the_log_holds(command_line: CommandLine, task: 
     assert stored.header.task_toml == task_file.text
     assert stored.header.seed == 3
     assert stored.header.tools == ("left", "right")
-    assert set(stored.header.versions) == {"trainer", "python", "numpy", "numba", "machine"}
+    assert set(stored.header.versions) == {"trainer", "python", "numpy", "scipy", "numba", "machine"}
     assert found["recording"] is stored.header.recording is None
 
 
@@ -148,6 +148,11 @@ REFUSED = [
     (["anastomosis/single-stitch", "--db", "folder"], "folder: "),
     (["anastomosis/single-stitch", "--db", "text.db"], "text.db: not a log"),
     (["anastomosis/single-stitch", "--record", "text.db/x.rrd"], "text.db: File exists"),
+    (["anastomosis/single-stitch", "--trainee", " "], "a trainee's name must not be empty"),
+    (["anastomosis/single-stitch", "--trainee", "x" * 101], "has at most 100 characters, found 101"),
+    (["anastomosis/single-stitch", "--trainee", "A\nB"], "must be plain text in one line, found '\\n' in it"),
+    (["anastomosis/single-stitch", "--trainee", "A\x1b[31m"], "in one line, found '\\x1b' in it"),
+    (["anastomosis/single-stitch", "--trainee", "A\udcff"], "in one line, found '\\udcff' in it"),
 ]
 
 
@@ -176,7 +181,14 @@ def test_what_cannot_be_used_is_refused_in_one_line(
 
 @pytest.mark.parametrize(
     "arguments",
-    [["--record", "x.rrd", "--no-record"], ["--record", "x.txt"], ["--seed", "-1"], ["--seed", "x"], ["--speed", "3"]],
+    [
+        ["--record", "x.rrd", "--no-record"],
+        ["--record", "x.txt"],
+        ["--seed", "-1"],
+        ["--seed", str(2**63)],
+        ["--seed", "x"],
+        ["--speed", "3"],
+    ],
     ids=" ".join,
 )
 def test_wrong_usage_exits_with_2(arguments: list[str], command_line: CommandLine) -> None:
@@ -288,6 +300,16 @@ def test_a_session_that_was_killed_is_announced_and_the_next_one_starts(
     code, _, err = command_line("practice", task, "--fast", "--db", db, "--no-record")
     assert code == 0
     assert err.startswith(f"trainer: session {killed} was interrupted: its first 0.33 s are kept, listed as aborted")
+
+
+def test_a_recording_is_remembered_by_its_whole_path(
+    command_line: CommandLine, task: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    _, out, _ = command_line("practice", task, "--fast", "--db", "log.db", "--record", "x.rrd", "--json")
+    with open_log(Path("log.db")) as log:
+        stored = reader.summary(log, "last").recording
+    assert stored == json.loads(out)["recording"] == str(tmp_path / "x.rrd")
 
 
 class Still:

@@ -25,7 +25,7 @@ def practice(
     device: Annotated[
         str, typer.Option(metavar="PROFILE|PATH", help="A device's name or .toml file, or a recording.")
     ] = "scripted-expert",
-    seed: Annotated[int, typer.Option(min=0, help="Seed of a scripted hand's chance.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Seed of a scripted hand's chance.")] = 0,
     realtime: Annotated[bool, typer.Option("--realtime/--fast", help="At the task's pace, or without pauses.")] = True,
     record: Annotated[
         Path | None, typer.Option(metavar="PATH.rrd", help="The recording; by default in recordings/ beside the log.")
@@ -44,15 +44,17 @@ def practice(
 
     from trainer.clock import Fast, Realtime
     from trainer.curriculum import load_task
-    from trainer.log.schema import default_db_path, new_session_id
+    from trainer.log.schema import default_db_path, new_session_id, trainee_name
 
+    name = trainee_name(trainee)
     session_id = new_session_id()
     log_path = db or default_db_path()
-    recording = None if no_record else record or log_path.parent / "recordings" / f"{session_id}.rrd"
+    # Absolute: the log names the recording to whoever looks for it later, from wherever.
+    recording = None if no_record else (record or log_path.parent / "recordings" / f"{session_id}.rrd").absolute()
     task_file = load_task(task)
     clock = (Realtime if realtime else Fast)(task_file.task.tick_hz)
     with ExitStack() as stack:
-        result = perform(stack, task_file, session_id, trainee, device, seed, clock, log_path, recording)
+        result = perform(stack, task_file, session_id, name, device, seed, clock, log_path, recording)
         if as_json:
             print(json.dumps(result, indent=2, allow_nan=False))
         else:
