@@ -161,6 +161,8 @@ def test_no_width_cuts_a_value(width: int) -> None:
     joined = " ".join(said.split())
     for r in (*made.targets, *made.others):
         assert wording.quantity(r.value, r.unit) in joined
+    for r in made.others:
+        assert f"{r.title} {wording.quantity(r.value, r.unit)}" in joined
 
 
 @pytest.mark.parametrize("kind", KINDS)
