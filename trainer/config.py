@@ -46,9 +46,9 @@ class Bounds:
     def __str__(self) -> str:
         parts = []
         if self.low > -math.inf:
-            parts.append(f"{'>' if self.low_open else '>='} {self.low:g}")
+            parts.append(f"{'>' if self.low_open else '>='} {_number(self.low)}")
         if self.high < math.inf:
-            parts.append(f"<= {self.high:g}")
+            parts.append(f"<= {_number(self.high)}")
         return " and ".join(parts)
 
 
@@ -171,7 +171,12 @@ def _check_bounds(value: float, name: str, key: str, bounds: Bounds | None) -> N
     if not math.isfinite(_as_float(value, name, key) if isinstance(value, int) else value):
         raise ConfigError(f"{name}: '{key}' must be finite, found {value}")
     if bounds is not None and not bounds.accepts(value):
-        raise ConfigError(f"{name}: '{key}' must be {bounds}, found {value:g}")
+        raise ConfigError(f"{name}: '{key}' must be {bounds}, found {_number(value)}")
+
+
+def _number(value: float) -> str:
+    """Whole numbers with all their digits: a seed's bound has nineteen."""
+    return str(value) if isinstance(value, int) else f"{value:g}"
 
 
 def _type_name(kind: Any) -> str:
