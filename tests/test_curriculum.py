@@ -86,6 +86,7 @@ WRONG: list[tuple[str, str, str]] = [
     ('direction = "out"', 'direction = "up"', r"'step\[1\]\.direction' must be one of 'in', 'out', found 'up'"),
     ("bite_mm = 0.35", "bite_mm = 2.5", r"'bite_mm' must not exceed the vessel's 'length_mm'"),
     ("link_mm = 0.2", "link_mm = 0.001", r"'length_mm' must be at most 10000 times 'link_mm'"),
+    ("length_mm = 2.0", "length_mm = 43.0", r"'layers' are too few: they must lie at most two outer diameters apart"),
     ("length_mm = 2.0", "length_mm = 1e30", r"'scene\.vessel\[0\]\.length_mm' must be >= 0\.0001 and <= 1000"),
     ("value = 500.0", "value = 1e300", r"'scene\.vessel\[0\]\.modulus_kPa' must be >= 1e-06 and <= 1e\+09"),
     ("value = 1.0", "value = 1e300", r"'scene\.vessel\[0\]\.puncture_outer_mN' must be > 0 and <= 1e\+06"),

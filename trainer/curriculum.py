@@ -54,6 +54,8 @@ class VesselSpec:
     def __post_init__(self) -> None:
         if self.wall_mm >= 0.5 * self.outer_diameter_mm:
             raise ValueError("'wall_mm' must be less than half of 'outer_diameter_mm'")
+        if self.length_mm > 2.0 * self.outer_diameter_mm * self.layers:
+            raise ValueError("'layers' are too few: they must lie at most two outer diameters apart")
         if self.around % 2:
             raise ValueError("'around' must be even, so that the links' diagonals can alternate")
         if math.hypot(*self.axis) < 1e-3:

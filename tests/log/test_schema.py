@@ -193,6 +193,12 @@ def test_a_log_whose_columns_lost_their_names_is_damaged(path: Path) -> None:
         open_log(path)
 
 
+def test_a_path_that_is_no_text_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match=r"udcff.db': a log's path must be plain text"):
+        create_log(tmp_path / "a\udcff.db")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_two_programs_may_make_the_log_at_once(tmp_path: Path) -> None:
     """The second finds the tables of the first, or waits for them; neither sees half of them."""
     with ThreadPoolExecutor(4) as pool:

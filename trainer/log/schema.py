@@ -189,6 +189,8 @@ def _reason(error: sqlite3.Error) -> str:
 
 def _connected(path: Path, prepare: Callable[[Database], None]) -> Database:
     """A connection on which ``prepare`` has done its work; closed again where that fails."""
+    if any(unicodedata.category(c) == "Cs" for c in str(path.absolute())):
+        raise LogError(f"{str(path)!a}: a log's path must be plain text, which SQLite stores as UTF-8")
     db = Database(path if can_write(path) or not path.exists() else _read_only(path))
     try:
         db.conn.execute("pragma foreign_keys = on")
