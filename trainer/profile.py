@@ -22,12 +22,8 @@ class Hand:
     bite_mm: float | None = field(default=None, metadata={"bounds": Bounds(0.0, 100.0, low_open=True)})
     clock_deg: float | None = field(default=None, metadata=ANGLE_DEG)
     entry_angle_error_deg: float = field(default=0.0, metadata={"bounds": Bounds(0.0, 90.0)})  # sd of the aimed angle
-    aim_error_mm: float = field(
-        default=0.0, metadata={"bounds": Bounds(0.0, 5.0)}
-    )  # sd of the aimed point, each way
-    tremor_rms_um: float = field(
-        default=0.0, metadata={"bounds": Bounds(0.0, 5000.0)}
-    )  # of the tip, all axes together
+    aim_error_mm: float = field(default=0.0, metadata={"bounds": Bounds(0.0, 5.0)})  # sd of the aimed point, each way
+    tremor_rms_um: float = field(default=0.0, metadata={"bounds": Bounds(0.0, 5000.0)})  # of the tip, all axes together
     tremor_hz: float = field(default=8.0, metadata={"bounds": Bounds(1.0, 20.0)})
     speed_mm_s: float = field(default=4.0, metadata={"bounds": Bounds(0.01, 1000.0)})
     hesitation_s: float = field(default=0.0, metadata={"bounds": Bounds(0.0, 60.0)})  # mean pause before each movement
