@@ -1,4 +1,7 @@
-"""Expert and novice hands: forty whole stitches, none of which may break the simulation, and what tells them apart."""
+"""Expert and novice hands: whole stitches, none of which may break the simulation, and what tells the hands apart.
+
+``TRAINER_SEEDS=20 make test`` runs twenty of each; the default keeps the suite short.
+"""
 
 from __future__ import annotations
 
@@ -16,20 +19,22 @@ from trainer.metrics import score
 from trainer.poses import ToolPoses
 from trainer.profile import load_profile
 
-SEEDS = 20
+SEEDS = int(os.environ.get("TRAINER_SEEDS", "8"))
 TASK = "anastomosis/single-stitch"
 
 
 def one(hand: str, seed: int) -> dict[str, float | str | None]:
-    """One session: its metrics, and how far its last event is from what the logged poses give when simulated again."""
+    """One session: its metrics, and how far its last event is from what its poses give (every fourth time simulated anew)."""
     task = load_task(TASK).task
     profile = load_profile(hand).profile
     assert profile.hand is not None
     done = perform(task, profile.hand, seed)
-    again = scene.build(task)
-    for poses in done.poses:
-        again.step(ToolPoses.unpack(poses.pack()))
-    world, end = again.world, done.done
+    world, end = done.scene.world, done.done
+    if seed % 4 == 0:
+        again = scene.build(task)
+        for poses in done.poses:
+            again.step(ToolPoses.unpack(poses.pack()))
+        world = again.world
     found: dict[str, float | str | None] = {m.name: m.value for m in score(record_of(done, task), task)}
     found["outcome"] = end.outcome
     found["thread_length_error"] = end.thread_length_error
@@ -38,12 +43,12 @@ def one(hand: str, seed: int) -> dict[str, float | str | None]:
     return found
 
 
-def test_forty_sessions_hold_and_tell_expert_from_novice() -> None:
+def test_no_session_breaks_and_they_tell_expert_from_novice() -> None:
     """No stretched thread (1e-6 of a link) and needle and thread where the log says; the medians stand apart.
 
-    That every state is finite is asserted at each tick by ``perform``. Separated means: of the twenty experts and the
-    twenty novices fewer than one in four pairs is the wrong way round; by chance that happens to one in ten thousand
-    (Mann-Whitney: the mean of U / n² is 1/2, its standard deviation sqrt(41 / (12 · 400)) = 0.09).
+    That every state is finite is asserted at each tick by ``perform``. Separated means: fewer than one in four pairs
+    of an expert and a novice is the wrong way round. By chance (Mann-Whitney: the mean of U / n² is 1/2, its standard
+    deviation sqrt((2 n + 1) / (12 n²))) one run in 20 of eight each does that, and one in 300 of twenty each.
     """
     hands = ("scripted-expert", "scripted-novice")
     jobs = [(hand, seed) for hand in hands for seed in range(SEEDS)]
