@@ -24,7 +24,7 @@ TASK = "anastomosis/single-stitch"
 
 
 def one(hand: str, seed: int) -> dict[str, float | str | None]:
-    """One session: its metrics, and how far its last event is from what its poses give (every fourth time simulated anew)."""
+    """One session: its metrics, and how true its last event is; every fourth time to a scene simulated anew."""
     task = load_task(TASK).task
     profile = load_profile(hand).profile
     assert profile.hand is not None

@@ -173,6 +173,8 @@ def versions() -> dict[str, str]:
 
     import numba
     import numpy as np
+    import scipy
+    from llvmlite.binding import get_host_cpu_name
 
     from trainer import __version__
 
@@ -180,8 +182,9 @@ def versions() -> dict[str, str]:
         "trainer": __version__,
         "python": platform.python_version(),
         "numpy": np.__version__,
+        "scipy": scipy.__version__,
         "numba": numba.__version__,
-        "machine": f"{platform.system()} {platform.machine()}",
+        "machine": f"{platform.system()} {platform.machine()} {get_host_cpu_name()}",
     }
 
 
