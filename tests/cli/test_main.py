@@ -81,7 +81,7 @@ ERRORS = [
         RecordingError(Path("x.rrd"), OSError(28, "No space left on device")),
         "trainer: x.rrd: cannot write the recording: No space left on device\n",
     ),
-    (PermissionError(13, "Permission denied", "/root/x"), "trainer: /root/x: Permission denied\n"),
+    (PermissionError(13, "Permission denied", "/locked/x"), "trainer: /locked/x: Permission denied\n"),
     (OSError(28, "No space left on device"), "trainer: No space left on device\n"),
     (KeyboardInterrupt(), "trainer: interrupted\n"),
 ]
