@@ -12,8 +12,9 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from trainer.bench import page, realtime, speed_error
-from trainer.bench.speed_error import KeptFactor, PaperRelaxation, Row, Work
+from trainer.bench import page, realtime, vessel
+from trainer.bench.rows import Row
+from trainer.bench.vessel import KeptFactor, PaperRelaxation, Work
 from trainer.clock import Realtime
 from trainer.mechanics.links import forces, hessian
 
@@ -23,7 +24,7 @@ MESH = (7, 8)
 
 @pytest.fixture(scope="module", params=[True, False], ids=["both ends clamped", "cut free"])
 def work(request: pytest.FixtureRequest) -> Work:
-    return speed_error.prepare(*MESH, both_ends=request.param)
+    return vessel.prepare(*MESH, both_ends=request.param)
 
 
 def test_the_answers_are_in_equilibrium_and_stable_with_the_node_in_its_place(work: Work) -> None:
@@ -33,13 +34,13 @@ def test_the_answers_are_in_equilibrium_and_stable_with_the_node_in_its_place(wo
     assert sorted(work.elimination) == np.flatnonzero(~fixed).tolist()
     clamps = len({round(float(v), 9) for v in work.mesh.rest[fixed][:, 0]})
     assert clamps == (2 if work.ends == "both ends clamped" else 1)
-    as_built = speed_error.prepare(*MESH, both_ends=False).mesh.rest_length
+    as_built = vessel.prepare(*MESH, both_ends=False).mesh.rest_length
     assert np.allclose(np.sort(work.mesh.rest_length), np.sort(as_built), rtol=1e-12)  # rounding of a difference
     coordinates = (3 * work.free[:, None] + np.arange(3)).ravel()
     for place, x in zip(work.places, work.answers, strict=True):
         assert np.array_equal(x[work.node], place)
         assert np.array_equal(x[fixed], work.mesh.rest[fixed])
-        assert np.linalg.norm(forces(work.mesh, x)[work.free]) <= speed_error.REFERENCE_mN
+        assert np.linalg.norm(forces(work.mesh, x)[work.free]) <= vessel.REFERENCE_mN
         stiffness = hessian(work.mesh, x)[np.ix_(coordinates, coordinates)]
         assert np.linalg.eigvalsh(stiffness)[0] > 0.0
     way = np.linalg.norm(work.places[-1] - work.places[0])
@@ -48,7 +49,7 @@ def test_the_answers_are_in_equilibrium_and_stable_with_the_node_in_its_place(wo
 
 @pytest.mark.parametrize(
     ("kind", "setting", "residual_mN"),
-    [(PaperRelaxation, 100_000.0, speed_error.RELAXED_mN), (KeptFactor, 1e-5, 1e-5)],
+    [(PaperRelaxation, 100_000.0, vessel.RELAXED_mN), (KeptFactor, 1e-5, 1e-5)],
     ids=["relaxation", "kept factor"],
 )
 def test_a_converged_method_finds_the_answer(
@@ -59,19 +60,19 @@ def test_a_converged_method_finds_the_answer(
     Twice that for the second order. The relaxation measures its residual while it sweeps, before the nodes move on,
     so that ten times its own bound is allowed for; the kept factor's spring gives way by f / SPRING, far less.
     """
-    [row] = speed_error.track(work, [(kind, setting)])
+    [row] = vessel.track(work, [(kind, setting)])
     assert row.status == "converged"
-    assert row.frames == 2 * speed_error.FRAMES_OUT
+    assert row.frames == 2 * vessel.FRAMES_OUT
     assert row.residual <= 10.0 * residual_mN
     coordinates = (3 * work.free[:, None] + np.arange(3)).ravel()
     softest = min(np.linalg.eigvalsh(hessian(work.mesh, x)[np.ix_(coordinates, coordinates)])[0] for x in work.answers)
-    give = np.max(np.abs([forces(work.mesh, x)[work.node] for x in work.answers])) * math.sqrt(3) / speed_error.SPRING
+    give = np.max(np.abs([forces(work.mesh, x)[work.node] for x in work.answers])) * math.sqrt(3) / vessel.SPRING
     assert row.error * work.radius_mm <= 2.0 * (row.residual / softest + give)
 
 
 def test_a_method_that_is_stopped_says_so_and_shows_its_error(work: Work) -> None:
     """A single sweep moves a node by less than the way that it lacks: the error is that of a vessel left behind."""
-    [row] = speed_error.start_cold(work, [(PaperRelaxation, 1.0)], starts=2)
+    [row] = vessel.start_cold(work, [(PaperRelaxation, 1.0)], starts=2)
     assert row.status == "stopped in 2 of 2 frames"
     assert row.error > 1e-3
     assert row.residual > 1e-3
@@ -79,7 +80,7 @@ def test_a_method_that_is_stopped_says_so_and_shows_its_error(work: Work) -> Non
 
 def rows() -> list[Row]:
     return [
-        Row(case, size, method, f"to {error:g}", 14, ms, 2 * ms, error, speed_error.ERROR_OF, 10 * error, "converged")
+        Row(case, size, method, f"to {error:g}", 14, ms, 2 * ms, error, vessel.ERROR_OF, 10 * error, "converged")
         for case in ("tracking", "cold")
         for size in (312, 1984)
         for method, factor in (("relaxation", 100.0), ("kept factor", 1.0))
@@ -163,7 +164,7 @@ def test_speed_error_writes_where_reports_are(
     monkeypatch.chdir(tmp_path)
     if reports:
         (tmp_path / "reports").mkdir()
-    monkeypatch.setattr(speed_error, "measure", lambda quick: (rows(), {312: 1.0, 1984: 6.0}))
+    monkeypatch.setattr(vessel, "measure", lambda quick: (rows(), {312: 1.0, 1984: 6.0}))
     code, out, err = command_line("bench", "speed-error", "--quick", "--json")
     assert code == 0
     assert json.loads(out)["quick"] is True
@@ -185,7 +186,7 @@ def test_bench_alone_is_a_short_run_of_all(
         asked.append(("realtime", seconds))
         return {"ticks": 1, "sessions": ["cut short"], **realtime.pace(tick_hz, [1.0])}
 
-    monkeypatch.setattr(speed_error, "measure", measured)
+    monkeypatch.setattr(vessel, "measure", measured)
     monkeypatch.setattr(realtime, "measure", ticked)
     code, out, _ = command_line("bench")
     assert code == 0

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from trainer.bench.machine import in_words
-from trainer.bench.speed_error import COLD_STARTS, FRAME_MM, FRAMES_OUT, REFERENCE_mN, Row
+from trainer.bench.rows import Row
+from trainer.bench.vessel import COLD_STARTS, FRAME_MM, FRAMES_OUT, REFERENCE_mN
 from trainer.reporting.svg import BLUE, GREY, INK, LINE, PAPER, VERMILLION, drawing, element, line, polyline, text
 
 #: The error at which the methods' times are compared, radii.

@@ -83,7 +83,7 @@ def speed_error(
     """Time against error of the ways to a vessel's equilibrium; writes speed_error.md, .svg and .json."""
     from trainer.bench import page
     from trainer.bench.machine import load
-    from trainer.bench.speed_error import measure
+    from trainer.bench.vessel import measure
     from trainer.cli.sessions import print_table
     from trainer.cli.warmup import announce
 

@@ -18,6 +18,7 @@ from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import spsolve
 
 from trainer.anatomy.vessel import build
+from trainer.bench.rows import Row
 from trainer.config import Sourced
 from trainer.curriculum import VesselSpec
 from trainer.geometry import Array
@@ -45,23 +46,6 @@ REFERENCE_mN = 1e-9
 SPRING = 1e8
 #: What the errors are.
 ERROR_OF = "solver: largest distance of a node to the converged answer of the same model, in radii of the vessel"
-
-
-@dataclass(frozen=True)
-class Row:
-    """One method with one setting on one case. Error and residual are the worst of all frames."""
-
-    case: str  # tracking or cold, and which ends are clamped
-    size: int  # nodes
-    method: str
-    setting: str
-    frames: int
-    median_ms: float  # a frame
-    p90_ms: float
-    error: float
-    error_of: str
-    residual: float  # mN, Euclidean norm of the forces on the free nodes
-    status: str
 
 
 @dataclass(frozen=True)
