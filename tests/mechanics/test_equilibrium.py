@@ -13,9 +13,9 @@ from trainer.curriculum import VesselSpec
 from trainer.geometry import Array, Rigid, quaternion_from_axis_angle
 from trainer.mechanics import banded
 from trainer.mechanics.attachments import Anchors, Cable, Loads
-from trainer.mechanics.equilibrium import MOST_STEPS, STEP_MM, Equilibrium
+from trainer.mechanics.equilibrium import Equilibrium
 from trainer.mechanics.links import blocks, forces, hessian, link_mesh
-from trainer.mechanics.minimise import CABLE_MM
+from trainer.mechanics.minimise import CABLE_MM, MOST_STEPS, STEP_MM
 from trainer.mechanics.relaxation import breadth_first, relax
 
 MODULUS_kPa = 1000.0
@@ -55,7 +55,7 @@ def test_banded_solve_is_the_dense_one(tissue: Tissue) -> None:
     mesh, order = tissue.mesh, tissue.orders()[1]
     kept = banded.factor(blocks(mesh, mesh.rest), mesh.links, order, len(mesh.rest))
     load, answer = np.random.default_rng(0).normal(size=mesh.rest.shape), np.zeros_like(mesh.rest)
-    banded.solve(kept, load, np.zeros(3 * len(order)), answer)
+    banded.solve(kept, load, np.zeros(3 * len(order), dtype=np.float32), answer)
     free = (3 * order[:, None] + np.arange(3)).ravel()
     dense = np.linalg.solve(hessian(mesh, mesh.rest)[np.ix_(free, free)], load.ravel()[free])
     assert np.abs(answer.ravel()[free] - dense).max() < 1e-3 * np.abs(dense).max()

@@ -1,12 +1,12 @@
 """Cholesky factor of a banded stiffness matrix, kept for many solves.
 
-A matrix whose entries lie within b of the diagonal needs n b² / 2 multiplications to factor and 2 n b to solve
+A matrix whose entries lie within b of the diagonal needs n b² multiplications to factor and 2 n b to solve
 (Golub and Van Loan, Matrix Computations, section 4.3). The factor is kept by columns, and both substitutions take the
 three columns of a node at once: forwards they subtract multiples of contiguous stretches, backwards they sum products.
 
-A solve is bound by the memory that it reads. The factor is computed in double precision and kept in single, which
-halves that memory; the arithmetic is double. So a solve is that of a matrix which differs from K by 1e-7 of its
-entries, exactly symmetric and positive definite: a base for iterations that measure their own residual, not an answer.
+The factor is computed in double precision; it is kept, and solved with, in single: a solve is bound by the memory that
+it reads and by the numbers that fit into a register, and single precision halves the one and doubles the other. So a
+solve is right to about 1e-6 of its answer: a base for iterations that measure their own residual, not an answer.
 """
 
 from __future__ import annotations
@@ -20,6 +20,8 @@ from trainer.geometry import Array
 
 #: A pivot below this share of the diagonal is lost in rounding: the matrix is singular, or not positive definite.
 SINGULAR = 1e-9
+#: Columns that the factorisation subtracts from a later one at once.
+GROUP = 4
 
 
 class BandedFactor(NamedTuple):
@@ -32,7 +34,7 @@ class BandedFactor(NamedTuple):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def assemble_band(blocks: Array, links: np.ndarray, place: np.ndarray, band: Array) -> None:
-    """Adds the link blocks (m, 3, 3) to ``band`` (3 f, b + 1), band[j, k] = K[j + k, j].
+    """Adds the link blocks (m, 3, 3) to ``band`` (3 f, b + 1 or more), band[j, k] = K[j + k, j].
 
     ``place`` (n,) is a node's position in the order of elimination, or -1 for a node without unknowns.
     """
@@ -60,35 +62,50 @@ def factor_band(
     last: int,
     least: float,
 ) -> int:
-    """L D Lᵀ of ``band`` (overwritten), L with unit diagonal: the columns ``first`` … ``last`` - 1, given those before.
+    """L D Lᵀ, L with unit diagonal: the columns ``first`` … ``last`` - 1, given those before (left-looking).
 
-    ``columns[j, k]`` is L[j + 1 + k, j], ``inverse[j]`` is 1 / D[j]. A pivot that
-    is below the share ``least`` of ``diagonal`` (3 f,), the band's own before, is replaced by it, so that the rest
-    stays finite. Returns how often that was done: unless it is 0, the factor is that of another matrix.
+    ``band`` (3 f, b + 1 + GROUP) holds K as in :func:`assemble_band`, with zeros in its last columns, and is
+    overwritten with D Lᵀ. ``columns[j, k]`` is L[j + 1 + k, j], ``inverse[j]`` is 1 / D[j]. A pivot that is below the
+    share ``least`` of ``diagonal`` (3 f,), the band's own before, is replaced by it, so that the rest stays finite.
+    Returns how often that was done: unless it is 0, the factor is that of another matrix.
     """
-    n, width = band.shape
-    b = width - 1
+    n, b = columns.shape
     replaced = 0
     for j in range(first, last):
+        size = min(b, n - 1 - j) + 1
+        i = max(0, j - b)
+        while i + GROUP <= j:  # written out below for a GROUP of four
+            # The last of them reaches furthest down; the others meet the band's zeros there.
+            reach = min(size, i + 3 + b - j + 1)
+            m0, m1 = band[i, j - i] * inverse[i], band[i + 1, j - i - 1] * inverse[i + 1]
+            m2, m3 = band[i + 2, j - i - 2] * inverse[i + 2], band[i + 3, j - i - 3] * inverse[i + 3]
+            s0, s1 = band[i, j - i : j - i + reach], band[i + 1, j - i - 1 : j - i - 1 + reach]
+            s2, s3 = band[i + 2, j - i - 2 : j - i - 2 + reach], band[i + 3, j - i - 3 : j - i - 3 + reach]
+            target = band[j, :reach]
+            for k in range(reach):
+                target[k] -= m0 * s0[k] + m1 * s1[k] + m2 * s2[k] + m3 * s3[k]
+            i += GROUP
+        while i < j:
+            reach = min(size, i + b - j + 1)
+            multiplier = band[i, j - i] * inverse[i]
+            source = band[i, j - i : j - i + reach]
+            target = band[j, :reach]
+            for k in range(reach):
+                target[k] -= multiplier * source[k]
+            i += 1
         pivot = band[j, 0]
         if not pivot > least * diagonal[j]:
             pivot = diagonal[j]
             replaced += 1
         inverse[j] = 1.0 / pivot
-        reach = min(b, n - 1 - j)
-        for k in range(1, reach + 1):
-            multiplier = band[j, k] * inverse[j]
-            columns[j, k - 1] = multiplier
-            source = band[j, k : reach + 1]
-            target = band[j + k, : reach + 1 - k]
-            for m in range(len(source)):
-                target[m] -= multiplier * source[m]
+        for k in range(1, size):
+            columns[j, k - 1] = band[j, k] * inverse[j]
     return replaced
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def substitute_forwards(columns: np.ndarray, inverse: Array, v: Array) -> None:
-    """Overwrites ``v`` (3 f,) with D⁻¹ L⁻¹ v."""
+def substitute_forwards(columns: np.ndarray, inverse: Array, v: np.ndarray) -> None:
+    """Overwrites ``v`` (3 f,) float32 with D⁻¹ L⁻¹ v."""
     n, b = columns.shape
     for j in range(0, n, 3):
         a0 = v[j]
@@ -113,15 +130,15 @@ def substitute_forwards(columns: np.ndarray, inverse: Array, v: Array) -> None:
 # The one kernel whose sums the compiler may reorder: they do not vectorise otherwise, and the factor would have to be
 # kept by rows as well. The order is fixed when it is compiled, so results are still the same bits in every run.
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc"})
-def substitute_backwards(columns: np.ndarray, v: Array) -> None:
-    """Overwrites ``v`` (3 f,) with L⁻ᵀ v."""
+def substitute_backwards(columns: np.ndarray, v: np.ndarray) -> None:
+    """Overwrites ``v`` (3 f,) float32 with L⁻ᵀ v."""
     n, b = columns.shape
     for j in range(n - 3, -1, -3):
         below = n - 3 - j
         reach = min(b - 2, below)
         c0, c1, c2 = columns[j, 2 : 2 + reach], columns[j + 1, 1 : 1 + reach], columns[j + 2, :reach]
         known = v[j + 3 : j + 3 + reach]
-        s0, s1, s2 = 0.0, 0.0, 0.0
+        s0 = s1 = s2 = np.float32(0.0)
         for k in range(reach):
             s0 += c0[k] * known[k]
             s1 += c1[k] * known[k]
@@ -137,7 +154,7 @@ def substitute_backwards(columns: np.ndarray, v: Array) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def gather(values: Array, order: np.ndarray, v: Array) -> None:
+def gather(values: Array, order: np.ndarray, v: np.ndarray) -> None:
     """``v`` (3 f,) takes the rows ``order`` of ``values`` (n, 3)."""
     for p in range(len(order)):
         for c in range(3):
@@ -145,7 +162,7 @@ def gather(values: Array, order: np.ndarray, v: Array) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def scatter(v: Array, order: np.ndarray, values: Array) -> None:
+def scatter(v: np.ndarray, order: np.ndarray, values: Array) -> None:
     """The rows ``order`` of ``values`` (n, 3) take ``v`` (3 f,)."""
     for p in range(len(order)):
         for c in range(3):
@@ -153,10 +170,10 @@ def scatter(v: Array, order: np.ndarray, values: Array) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def solve(kept: BandedFactor, values: Array, v: Array, out: Array) -> None:
+def solve(kept: BandedFactor, values: Array, v: np.ndarray, out: Array) -> None:
     """K⁻¹ of the forces ``values`` (n, 3) mN on the factor's nodes into the same rows of ``out`` (n, 3) mm.
 
-    Overwrites ``v``, at least (3 f,).
+    Overwrites ``v``, at least (3 f,) float32.
     """
     u = v[: len(kept.inverse)]
     gather(values, kept.order, u)
@@ -179,7 +196,7 @@ class Factoring:
         size = 3 * len(order)
         b = min(3 * reach + 2, size - 1)
         # Written now: a page of memory that is touched for the first time costs time, milliseconds for these.
-        self._band = np.full((size, b + 1), 0.0)
+        self._band = np.full((size, b + 1 + GROUP), 0.0)
         self._diagonal = np.zeros(size)
         self._next = 0
         columns = np.full((size, b), 0.0, dtype=np.float32)

@@ -14,11 +14,13 @@ from trainer.mechanics.links import LinkMesh, link_blocks
 from trainer.mechanics.quasi_newton import at_points
 
 #: Slices into which a new factorisation is divided.
-SLICES = 20
+SLICES = 10
 #: Solves for which a new factor is used before another one of the same body may be begun.
-LASTS = 15
+LASTS = 2
 #: At rest no pivot is below 0.4 of the diagonal. A state in which one is below this is nearly or truly unstable.
 LEAST_PIVOT = 0.05
+#: In place of a slot's body: the slot holds nothing.
+FREE = -1
 
 
 class Compliance:
@@ -44,11 +46,12 @@ class Compliance:
         ]
         # The next factor of each body.
         self._next = [banded.Factoring(mesh.links[lo:hi], orders[b], n) for b, (lo, hi) in enumerate(self.links)]
-        self._v = np.zeros(3 * max(len(order) for order in orders))
+        self._v = np.zeros(3 * max(len(order) for order in orders), dtype=np.float32)
         self._push = np.zeros((n, 3))
         self._free: list[int] = []
         self.slot_nodes = np.zeros((0, 3), dtype=np.int64)
-        self.slot_weights = np.zeros((0, 3))  # zero for a slot that is free
+        self.slot_weights = np.zeros((0, 3))
+        self.slot_body: list[int] = []  # FREE for a slot that is
         self.slot_range = np.zeros((0, 2), dtype=np.int64)  # rows of the nodes of the slot's body
         self.columns = np.zeros((0, 3, n, 3))  # K⁻¹ Wᵀ, mm per mN
         self.matrix = np.zeros((0, 0))  # W K⁻¹ Wᵀ over all slots
@@ -71,6 +74,7 @@ class Compliance:
         self.slot_nodes[slot] = nodes
         self.slot_weights[slot] = weights
         self.slot_range[slot] = self.nodes[body]
+        self.slot_body[slot] = body
         self._answers(slot, self.factors[body], self.columns[slot])
         self._couple(slot)
         return slot
@@ -78,6 +82,7 @@ class Compliance:
     def drop(self, slot: int) -> None:
         """Gives the slot back; its number may be given out again."""
         self.slot_weights[slot] = 0.0
+        self.slot_body[slot] = FREE
         self._ready.pop(slot, None)
         self._free.append(slot)
         self._free.sort()
@@ -107,17 +112,17 @@ class Compliance:
             return
         if not complete:
             return
-        held = np.flatnonzero((self.slot_range[:, 0] == self.nodes[body][0]) & np.any(self.slot_weights != 0.0, axis=1))
-        waiting = [int(s) for s in held if int(s) not in self._ready]
+        held = [slot for slot, of in enumerate(self.slot_body) if of == body]
+        waiting = [slot for slot in held if slot not in self._ready]
         if waiting:
             self._ready[waiting[0]] = np.zeros(self.columns.shape[1:])
             self._answers(waiting[0], work.factor, self._ready[waiting[0]])
             return
         self.factors[body], work.factor = work.factor, self.factors[body]
         for slot in held:
-            self.columns[slot] = self._ready[int(slot)]
+            self.columns[slot] = self._ready[slot]
         for slot in held:
-            self._couple(int(slot))
+            self._couple(slot)
         self._age[body] = 0
         self._under_way = None
         self._ready = {}
@@ -154,6 +159,7 @@ class Compliance:
         old = len(self.slot_nodes)
         new = max(8, 2 * old)
         self._free = list(range(old, new))
+        self.slot_body += [FREE] * (new - old)
         self.slot_nodes = _grown(self.slot_nodes, (new, 3))
         self.slot_weights = _grown(self.slot_weights, (new, 3))
         self.slot_range = _grown(self.slot_range, (new, 2))

@@ -9,28 +9,22 @@ rest stiffness misleads is factored anew where it is, a slice at each solve. A b
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from trainer.geometry import Array
 from trainer.mechanics.attachments import Anchors, Cable, Loads, Rows, flatten
-from trainer.mechanics.compliance import Compliance
+from trainer.mechanics.compliance import FREE, Compliance
 from trainer.mechanics.links import LinkMesh
-from trainer.mechanics.minimise import Base, Bodies, Held, Memory, minimise, pull_points
+from trainer.mechanics.minimise import Base, Bodies, Held, Memory, approach
 
-#: Secant pairs kept from one solve to the next: twelve take the same number of iterations in a stitch, and more time.
-PAIRS = 6
-#: A target further away than this, mm, is approached in steps of this size, so that the tissue follows its path …
-STEP_MM = 0.1
-#: … in at most so many steps in one solve; the rest of the way is left to the next.
-MOST_STEPS = 8
-#: A cable's penalty, as a multiple of the tissue's own stiffness along it.
-CABLE_PENALTY = 1e3
+#: Secant pairs kept from one solve to the next: fewer take more iterations where a thread draws at the tissue.
+PAIRS = 8
 #: More iterations than this in a solve: the kept factor no longer serves, begin a new one.
-SLOW = 8
-#: On the way to a target that has leapt, the residual may be so many times the tolerance.
-STEP_TOLERANCE = 100.0
+SLOW = 5
 
 
 @dataclass(frozen=True)
@@ -44,6 +38,15 @@ class Result:
     anchor_force: Array  # (a, 3) mN, on the tissue, at the targets as far as they were reached
     tension: Array  # (c,) mN
     cable_error_mm: float  # longest excess of a cable's path
+
+
+class _Group(NamedTuple):
+    """Bodies that are solved together, because cables join them, and what holds them: numbers in the lists given."""
+
+    bodies: list[int]
+    anchors: list[int]
+    cables: list[int]
+    loads: list[int]
 
 
 class Equilibrium:
@@ -69,19 +72,21 @@ class Equilibrium:
         self._memory = Memory(
             s=np.zeros((PAIRS, n, 3)),
             y=np.zeros((PAIRS, n, 3)),
-            product=np.zeros((PAIRS, bodies)),
-            ring=np.zeros(2, dtype=np.int64),
+            product=np.zeros((bodies, PAIRS)),
+            newest=np.zeros(bodies, dtype=np.int64),
+            known=np.zeros(bodies, dtype=np.int64),
             force=np.zeros((n, 3)),
             old_force=np.zeros((n, 3)),
             g=np.zeros((n, 3)),
             q=np.zeros((n, 3)),
             z=np.zeros((n, 3)),
             trial=mesh.rest.copy(),
-            v=np.zeros(3 * max(len(order) for order in orders)),
+            v=np.zeros(3 * max(len(order) for order in orders), dtype=np.float32),
         )
         self._at_rest = [True] * bodies
         self._last_target: dict[int, Array] = {}
         self._tension: dict[tuple[int, ...], float] = {}
+        self._scratch: dict[tuple[int, ...], Held] = {}
 
     def hold(self, nodes: np.ndarray, weights: Array) -> int:
         """A slot for the material point that is the mean of ``nodes`` (3,) with ``weights`` (3,), all of one body."""
@@ -112,103 +117,140 @@ class Equilibrium:
         that the tissue is in equilibrium at each instant). Raises ValueError when a given number is not finite.
         """
         anchors = Anchors.none() if anchors is None else anchors
-        rows = flatten(anchors, cables, Loads.none() if loads is None else loads)
-        held = self._held(rows, cables)
-        pull_points(self.x, rows, held)
-        start = np.array([self._last_target.get(int(s), self.position(int(s))) for s in anchors.slot]).reshape(-1, 3)
-        way = rows.target - start
-        distance = _distance(rows.stiffness, way)
-        length = rows.length.copy()
-        excess = np.maximum(held.stretch, 0.0)
-        far = max(float(np.max(distance, initial=0.0)), float(np.max(excess, initial=0.0)))
-        steps = min(max(int(np.ceil(far / STEP_MM)), 1), MOST_STEPS)
-        share = np.minimum(1.0, steps * STEP_MM / np.maximum(distance, 1e-300))
-        shortened = np.minimum(excess, steps * STEP_MM)
-        iterations = 0
-        for step in range(1, steps + 1):
-            rows.target[:] = start + (share * step / steps)[:, None] * way
-            rows.length[:] = length + excess - shortened * step / steps
-            tolerance = tolerance_mN if step == steps else STEP_TOLERANCE * tolerance_mN
-            converged, used, residual = minimise(
-                self.x, self._bodies, self._base(), rows, held, self._memory, tolerance, max_iterations
+        loads = Loads.none() if loads is None else loads
+        groups = self._groups(anchors, cables, loads)
+        self._rest(groups)
+        found = Result(True, 0, 0.0, 1.0, np.zeros((len(anchors.slot), 3)), np.zeros(len(cables)), 0.0)
+        targets: dict[int, Array] = {}
+        tension: dict[tuple[int, ...], float] = {}
+        for group in groups:
+            part = self._solve(group, anchors, cables, loads, tolerance_mN, max_iterations, targets, tension)
+            found.anchor_force[group.anchors] = part.anchor_force
+            found.tension[group.cables] = part.tension
+            found = Result(
+                converged=found.converged and part.converged,
+                iterations=found.iterations + part.iterations,
+                residual_mN=math.hypot(found.residual_mN, part.residual_mN),
+                reached=min(found.reached, part.reached),
+                anchor_force=found.anchor_force,
+                tension=found.tension,
+                cable_error_mm=max(found.cable_error_mm, part.cable_error_mm),
             )
-            iterations += used
-        if iterations > steps * SLOW or not converged:
-            self.compliance.refresh(held.awake.tolist(), self.x)
         self.compliance.advance()
-        self._last_target = {int(s): t.copy() for s, t in zip(anchors.slot, rows.target, strict=True)}
-        self._tension = {_key(c): float(t) for c, t in zip(cables, held.multiplier, strict=True)}
-        cable_share = np.where(excess > 0.0, shortened / np.maximum(excess, 1e-300), 1.0)
-        reached = min(float(np.min(share, initial=1.0)), float(np.min(cable_share, initial=1.0)))
+        self._last_target, self._tension = targets, tension
+        return found
+
+    def _solve(
+        self,
+        group: _Group,
+        all_anchors: Anchors,
+        all_cables: tuple[Cable, ...],
+        all_loads: Loads,
+        tolerance_mN: float,
+        max_iterations: int,
+        targets: dict[int, Array],
+        tensions: dict[tuple[int, ...], float],
+    ) -> Result:
+        """The equilibrium of one group of bodies; notes its ``targets`` and ``tensions`` for the next solve."""
+        a, anchors = group.anchors, all_anchors
+        if len(a) < len(anchors.slot):
+            anchors = Anchors(anchors.slot[a], anchors.target[a], anchors.stiffness[a])
+        cables = tuple(all_cables[c] for c in group.cables)
+        rows = flatten(anchors, cables, Loads(all_loads.slot[group.loads], all_loads.force[group.loads]))
+        held = self._held(group.bodies, rows, cables)
+        way = np.zeros_like(rows.target)
+        for n, slot in enumerate(anchors.slot.tolist()):
+            before = self._last_target.get(slot)
+            way[n] = rows.target[n] - (self.position(slot) if before is None else before)
+        anchor_force, tension = np.zeros_like(way), np.zeros(len(cables))
+        converged, iterations, steps, residual, reached = approach(
+            self.x, self._bodies, self._base(), rows, held, self._memory, way, np.zeros(len(cables)), tolerance_mN,
+            max_iterations, anchor_force, tension,
+        )  # fmt: skip
+        if iterations > steps * SLOW or not converged:
+            self.compliance.refresh(group.bodies, self.x)
+        targets.update(zip(anchors.slot.tolist(), rows.target, strict=True))
+        tensions.update(zip(map(_key, cables), held.multiplier.tolist(), strict=True))
         return Result(
             converged=converged and reached == 1.0,
             iterations=iterations,
             residual_mN=residual,
             reached=reached,
-            anchor_force=np.einsum("aij,aj->ai", rows.stiffness, rows.target - held.point[rows.anchor_at]),
-            tension=np.maximum(0.0, held.multiplier + held.penalty * held.stretch),
-            cable_error_mm=float(np.max(held.stretch, initial=0.0)),
+            anchor_force=anchor_force,
+            tension=tension,
+            cable_error_mm=max(0.0, *held.stretch.tolist()) if cables else 0.0,
         )
+
+    def _groups(self, anchors: Anchors, cables: tuple[Cable, ...], loads: Loads) -> list[_Group]:
+        """The bodies that something holds, those that a cable joins together. Raises ValueError for a free slot, and
+        for a cable through no material point."""
+        on_anchors, on_loads = self._bodies_of(anchors.slot), self._bodies_of(loads.slot)
+        on_cables = [self._bodies_of(cable.slot[cable.slot >= 0]) for cable in cables]
+        if not all(on_cables):
+            raise ValueError("a cable runs through no material point")
+        groups: list[set[int]] = []
+        for joined in [*({b} for b in on_anchors), *({b} for b in on_loads), *map(set, on_cables)]:
+            apart = [g for g in groups if not g & joined]
+            groups = [*apart, joined.union(*(g for g in groups if g & joined))]
+        return [
+            _Group(
+                bodies=sorted(group),
+                anchors=[n for n, b in enumerate(on_anchors) if b in group],
+                cables=[n for n, through in enumerate(on_cables) if through[0] in group],
+                loads=[n for n, b in enumerate(on_loads) if b in group],
+            )
+            for group in sorted(groups, key=min)
+        ]
+
+    def _bodies_of(self, slots: np.ndarray) -> list[int]:
+        found = [self.compliance.slot_body[slot] for slot in slots.tolist()]
+        if FREE in found:
+            raise ValueError("a slot is used that was dropped")
+        return found
+
+    def _rest(self, groups: list[_Group]) -> None:
+        """Puts to rest the bodies that nothing holds: the only state without force that they have."""
+        awake = {b for group in groups for b in group.bodies}
+        for b, (lo, hi) in enumerate(self.compliance.nodes):
+            if b not in awake and not self._at_rest[b]:
+                self.x[lo:hi] = self.mesh.rest[lo:hi]
+                self._memory.known[b] = 0
+            self._at_rest[b] = b not in awake
 
     def _base(self) -> Base:
         c = self.compliance
         return Base(tuple(c.factors), c.columns, c.slot_range, c.matrix)
 
-    def _held(self, rows: Rows, cables: tuple[Cable, ...]) -> Held:
-        """The arrays of one solve. A body that nothing holds is put to rest, the only state without force it has."""
-        kept = self.compliance
-        u, c = len(rows.slots), len(rows.length)
-        nodes, weights = kept.slot_nodes[rows.slots], kept.slot_weights[rows.slots]
-        if not weights.any(axis=1).all():
-            raise ValueError("a slot is used that was dropped")
-        awake = sorted(set(kept.body_of(nodes[:, 0]).tolist()))
-        if [b not in awake for b in range(len(kept.nodes))] != self._at_rest:
-            self._memory.ring[1] = 0  # the pairs are of other bodies
-        for b, (lo, hi) in enumerate(kept.nodes):
-            if b not in awake and not self._at_rest[b]:
-                self.x[lo:hi] = self.mesh.rest[lo:hi]
-                self._memory.z[lo:hi] = 0.0  # it may lie between two that are awake
-            self._at_rest[b] = b not in awake
-        held = Held(
-            awake=np.array(awake, dtype=np.int64),
-            first=kept.nodes[awake[0]][0] if awake else 0,
-            last=kept.nodes[awake[-1]][1] if awake else 0,
-            nodes=nodes,
-            weights=weights,
-            multiplier=np.array([self._tension.get(_key(cable), 0.0) for cable in cables]),
-            penalty=np.ones(c),
-            row=np.zeros((len(rows.cable_at), 3)),
-            point=np.zeros((u, 3)),
-            force=np.zeros((u, 3)),
-            matrix=np.zeros((3 * u, 3 * u)),
-            stretch=np.zeros(c),
-            moved=np.zeros((PAIRS, u, 3)),
-            pulled=np.zeros((PAIRS, u, 3)),
-            answer=np.zeros((u, 3)),
-            at=np.zeros((u, 3)),
-            system=np.zeros((3 * u, 3 * u)),
-            curvature=np.zeros(PAIRS),
-            share=np.zeros(PAIRS),
-        )
-        if c:
-            pull_points(self.x, rows, held)  # for the rows' directions
-            dof = (3 * rows.slots[:, None] + np.arange(3)).ravel()
-            compliance = kept.matrix[np.ix_(dof, dof)]
-            for n in range(c):
-                d = np.zeros((u, 3))
-                for k in range(rows.cable_start[n], rows.cable_start[n + 1]):
-                    if rows.cable_at[k] >= 0:
-                        d[rows.cable_at[k]] += held.row[k]
-                give = float(d.ravel() @ compliance @ d.ravel())
-                held.penalty[n] = CABLE_PENALTY / give if give > 0.0 else 1.0
+    def _held(self, awake: list[int], rows: Rows, cables: tuple[Cable, ...]) -> Held:
+        """The arrays of one solve for the bodies ``awake``, kept for each size: a stitch has a few dozen."""
+        u, c, k = len(rows.slots), len(rows.length), len(rows.cable_at)
+        size = (u, c, k, *awake)
+        if size not in self._scratch:
+            self._scratch[size] = Held(
+                awake=np.array(awake, dtype=np.int64),
+                nodes=np.zeros((u, 3), dtype=np.int64),
+                weights=np.zeros((u, 3)),
+                multiplier=np.zeros(c),
+                penalty=np.ones(c),
+                row=np.zeros((k, 3)),
+                point=np.zeros((u, 3)),
+                force=np.zeros((u, 3)),
+                matrix=np.zeros((3 * u, 3 * u)),
+                stretch=np.zeros(c),
+                moved=np.zeros((PAIRS, u, 3)),
+                pulled=np.zeros((PAIRS, u, 3)),
+                answer=np.zeros((u, 3)),
+                at=np.zeros((u, 3)),
+                system=np.zeros((3 * u, 3 * u)),
+                curvature=np.zeros(PAIRS),
+                share=np.zeros(PAIRS),
+            )
+        held = self._scratch[size]
+        held.nodes[:] = self.compliance.slot_nodes[rows.slots]
+        held.weights[:] = self.compliance.slot_weights[rows.slots]
+        for n, cable in enumerate(cables):
+            held.multiplier[n] = self._tension.get(_key(cable), 0.0)
         return held
-
-
-def _distance(stiffness: Array, way: Array) -> Array:
-    """How far (a,) mm targets move in the directions in which the anchors hold."""
-    norm = np.max(np.sum(np.abs(stiffness), axis=2), axis=1, initial=0.0)
-    across = np.linalg.norm(np.einsum("aij,aj->ai", stiffness, way), axis=1)
-    return np.asarray(across / np.maximum(norm, 1e-300))
 
 
 def _key(cable: Cable) -> tuple[int, ...]:

@@ -18,8 +18,16 @@ from trainer.mechanics.attachments import Rows, pull
 from trainer.mechanics.links import add_forces
 from trainer.mechanics.quasi_newton import add_scaled, after_base, at_points, before_base, dot, hold_base, spread
 
+#: A target further away than this, mm, is approached in steps of this size, so that the tissue follows its path …
+STEP_MM = 0.1
+#: … in at most so many steps in one solve; the rest of the way is left to the next.
+MOST_STEPS = 8
+#: On the way to a target that has leapt, the residual may be so many times the tolerance.
+STEP_TOLERANCE = 100.0
 #: A cable's path may be longer than the cable by this much, mm.
 CABLE_MM = 1e-5
+#: A cable's penalty, as a multiple of the tissue's own stiffness along it.
+CABLE_PENALTY = 1e3
 #: Sufficient decrease (Armijo), and the shortest step tried.
 DECREASE, SHORTEST_STEP = 1e-4, 1e-4
 #: Share of an energy that is lost to rounding when it is summed over thousands of links.
@@ -48,27 +56,26 @@ class Base(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """Secant pairs in a ring, and scratch; all that is kept from one solve to the next."""
+    """Each body's secant pairs in a ring, and scratch; all that is kept from one solve to the next."""
 
     s: Array  # (pairs, n, 3) mm
     y: Array  # (pairs, n, 3) mN
-    product: Array  # (pairs, bodies) s · y
-    ring: np.ndarray  # (2,) int64, the newest pair and how many there are
+    product: Array  # (bodies, pairs) s · y
+    newest: np.ndarray  # (bodies,) int64, the newest pair
+    known: np.ndarray  # (bodies,) int64, how many there are
     force: Array  # (n, 3) mN, of the links at the last evaluation
     old_force: Array  # (n, 3)
     g: Array  # (n, 3)
     q: Array  # (n, 3)
     z: Array  # (n, 3)
     trial: Array  # (n, 3)
-    v: Array  # (3 free nodes of the largest body,)
+    v: np.ndarray  # (3 free nodes of the largest body,) float32
 
 
 class Held(NamedTuple):
     """What one solve holds at u points in use by c cables with k points, and the arrays of its size."""
 
-    awake: np.ndarray  # (bodies that are not at rest,) int64
-    first: int  # rows of the nodes that take part
-    last: int
+    awake: np.ndarray  # (b,) int64, the bodies that are solved for
     nodes: np.ndarray  # (u, 3)
     weights: Array  # (u, 3)
     multiplier: Array  # (c,) mN
@@ -98,8 +105,8 @@ def pull_points(x: Array, rows: Rows, held: Held) -> float:
 def evaluate(x: Array, bodies: Bodies, rows: Rows, held: Held, memory: Memory) -> float:
     """The energy at ``x`` (n, 3); leaves the nodes' elastic forces, the points' forces and their stiffness behind."""
     energy = 0.0
-    memory.force[held.first : held.last] = 0.0
     for b in held.awake:
+        memory.force[bodies.nodes[b, 0] : bodies.nodes[b, 1]] = 0.0
         first, last = bodies.span[b, 0], bodies.span[b, 1]
         energy += add_forces(x, bodies.links, bodies.rest_length, bodies.stiffness, first, last, memory.force)
     return energy + pull_points(x, rows, held)
@@ -109,26 +116,30 @@ def evaluate(x: Array, bodies: Bodies, rows: Rows, held: Held, memory: Memory) -
 def gradient(bodies: Bodies, held: Held, memory: Memory) -> float:
     """Minus the unbalanced forces on free nodes at the last evaluation, into ``memory.g``; their norm, mN."""
     g, force = memory.g, memory.force
-    for i in range(held.first, held.last):
-        for c in range(3):
-            g[i, c] = -force[i, c]
+    for b in held.awake:
+        for i in range(bodies.nodes[b, 0], bodies.nodes[b, 1]):
+            for c in range(3):
+                g[i, c] = -force[i, c]
     spread(-1.0, held.force, held.nodes, held.weights, g)
-    for i in range(held.first, held.last):
-        if bodies.fixed[i]:
-            g[i, 0] = g[i, 1] = g[i, 2] = 0.0
-    return math.sqrt(dot(g, g, held.first, held.last))
+    squared = 0.0
+    for b in held.awake:
+        lo, hi = bodies.nodes[b, 0], bodies.nodes[b, 1]
+        for i in range(lo, hi):
+            if bodies.fixed[i]:
+                g[i, 0] = g[i, 1] = g[i, 2] = 0.0
+        squared += dot(g, g, lo, hi)
+    return math.sqrt(squared)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def direction(base: Base, rows: Rows, held: Held, memory: Memory) -> float:
+def direction(bodies: Bodies, base: Base, rows: Rows, held: Held, memory: Memory) -> float:
     """A step towards the energy's minimum into ``memory.z``, from ``memory.g``; returns the slope along it, mN mm."""
-    lo, hi = held.first, held.last
     q, z = memory.q, memory.z
-    newest, count = memory.ring[0], memory.ring[1]
-    q[lo:hi] = memory.g[lo:hi]
+    for b in held.awake:
+        q[bodies.nodes[b, 0] : bodies.nodes[b, 1]] = memory.g[bodies.nodes[b, 0] : bodies.nodes[b, 1]]
     before_base(
-        q, memory.s, memory.y, memory.product, newest, count, held.matrix, held.nodes, held.weights, held.awake,
-        lo, hi, held.moved, held.pulled, held.curvature, held.share,
+        q, memory.s, memory.y, memory.product, memory.newest, memory.known, held.matrix, held.nodes, held.weights,
+        held.awake, bodies.nodes, held.moved, held.pulled, held.curvature, held.share,
     )  # fmt: skip
     for b in held.awake:
         banded.solve(base.factors[b], q, memory.v, z)
@@ -137,36 +148,41 @@ def direction(base: Base, rows: Rows, held: Held, memory: Memory) -> float:
         held.at, held.answer, held.system,
     )  # fmt: skip
     after_base(
-        z, memory.s, memory.y, newest, count, held.nodes, held.weights, lo, hi, held.pulled, held.curvature,
-        held.share, held.at,
+        z, memory.s, memory.y, memory.newest, memory.known, held.nodes, held.weights, held.awake, bodies.nodes,
+        held.pulled, held.curvature, held.share, held.at,
     )  # fmt: skip
-    return dot(memory.g, z, lo, hi)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def keep_pair(x: Array, bodies: Bodies, held: Held, memory: Memory) -> None:
-    """The accepted step becomes the newest secant pair, and ``x`` (n, 3) the trial."""
-    pairs = len(memory.s)
-    k = (memory.ring[0] + 1) % pairs
-    memory.ring[0] = k
-    memory.ring[1] = min(memory.ring[1] + 1, pairs)
-    s, y, trial = memory.s[k], memory.y[k], memory.trial
-    for i in range(held.first, held.last):
-        for c in range(3):
-            s[i, c] = trial[i, c] - x[i, c]
-            y[i, c] = memory.old_force[i, c] - memory.force[i, c]
-            x[i, c] = trial[i, c]
+    slope = 0.0
     for b in held.awake:
-        memory.product[k, b] = dot(s, y, bodies.nodes[b, 0], bodies.nodes[b, 1])
+        slope += dot(memory.g, z, bodies.nodes[b, 0], bodies.nodes[b, 1])
+    return slope
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def largest(a: Array, first: int, last: int) -> float:
-    """The largest absolute value in the rows ``first`` … ``last`` - 1 of ``a`` (n, 3)."""
-    u = a[first:last].reshape(-1)
+def keep_pairs(x: Array, bodies: Bodies, held: Held, memory: Memory) -> None:
+    """The accepted step becomes each body's newest secant pair, and ``x`` (n, 3) the trial."""
+    pairs = len(memory.s)
+    for b in held.awake:
+        k = (memory.newest[b] + 1) % pairs
+        memory.newest[b] = k
+        memory.known[b] = min(memory.known[b] + 1, pairs)
+        s, y, trial = memory.s[k], memory.y[k], memory.trial
+        lo, hi = bodies.nodes[b, 0], bodies.nodes[b, 1]
+        for i in range(lo, hi):
+            for c in range(3):
+                s[i, c] = trial[i, c] - x[i, c]
+                y[i, c] = memory.old_force[i, c] - memory.force[i, c]
+                x[i, c] = trial[i, c]
+        memory.product[b, k] = dot(s, y, lo, hi)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def largest(a: Array, bodies: Bodies, held: Held) -> float:
+    """The largest absolute value in the rows of ``a`` (n, 3) that belong to the bodies that are solved for."""
     most = 0.0
-    for i in range(len(u)):
-        most = max(most, abs(u[i]))
+    for b in held.awake:
+        u = a[bodies.nodes[b, 0] : bodies.nodes[b, 1]].reshape(-1)
+        for i in range(len(u)):
+            most = max(most, abs(u[i]))
     return most
 
 
@@ -195,7 +211,6 @@ def minimise(
     max_iterations: int,
 ) -> tuple[bool, int, float]:
     """Moves ``x`` (n, 3) until the residual and the cables' excess are small: (converged, iterations, residual mN)."""
-    lo, hi = held.first, held.last
     energy = evaluate(x, bodies, rows, held, memory)
     residual = gradient(bodies, held, memory)
     for iteration in range(max_iterations):
@@ -204,22 +219,27 @@ def minimise(
                 return True, iteration, residual
             energy = evaluate(x, bodies, rows, held, memory)
             residual = gradient(bodies, held, memory)
-        slope = direction(base, rows, held, memory)
+        slope = direction(bodies, base, rows, held, memory)
         if not slope > 0.0:  # the pairs mislead: the base alone always leads down
-            memory.ring[1] = 0
-            slope = direction(base, rows, held, memory)
+            for b in held.awake:
+                memory.known[b] = 0
+            slope = direction(bodies, base, rows, held, memory)
             if not slope > 0.0:
                 return False, iteration, residual
-        t = min(1.0, bodies.longest_step / max(largest(memory.z, lo, hi), 1e-300))
-        memory.old_force[lo:hi] = memory.force[lo:hi]
+        t = min(1.0, bodies.longest_step / max(largest(memory.z, bodies, held), 1e-300))
+        for b in held.awake:
+            lo, hi = bodies.nodes[b, 0], bodies.nodes[b, 1]
+            memory.old_force[lo:hi] = memory.force[lo:hi]
         # What rounding of the energy's sum, and of coordinates far from the origin, can pretend.
         held_with = 0.0
         for i in range(len(held.force)):
             held_with += abs(held.force[i, 0]) + abs(held.force[i, 1]) + abs(held.force[i, 2])
-        noise = ROUNDING * (abs(energy) + largest(x, lo, hi) * held_with)
+        noise = ROUNDING * (abs(energy) + largest(x, bodies, held) * held_with)
         while True:
-            memory.trial[lo:hi] = x[lo:hi]
-            add_scaled(-t, memory.z, memory.trial, lo, hi)
+            for b in held.awake:
+                lo, hi = bodies.nodes[b, 0], bodies.nodes[b, 1]
+                memory.trial[lo:hi] = x[lo:hi]
+                add_scaled(-t, memory.z, memory.trial, lo, hi)
             new_energy = evaluate(memory.trial, bodies, rows, held, memory)
             if new_energy <= energy - DECREASE * t * slope + noise:
                 break
@@ -228,9 +248,107 @@ def minimise(
                 evaluate(x, bodies, rows, held, memory)
                 return False, iteration, gradient(bodies, held, memory)
         energy = new_energy
-        keep_pair(x, bodies, held, memory)
+        keep_pairs(x, bodies, held, memory)
         residual = gradient(bodies, held, memory)
     converged = residual <= tolerance_mN
     for c in range(len(held.stretch)):
         converged = converged and held.stretch[c] <= CABLE_MM
     return converged, max_iterations, residual
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def approach(
+    x: Array,
+    bodies: Bodies,
+    base: Base,
+    rows: Rows,
+    held: Held,
+    memory: Memory,
+    way: Array,
+    excess: Array,
+    tolerance_mN: float,
+    max_iterations: int,
+    anchor_force: Array,
+    tension: Array,
+) -> tuple[bool, int, int, float, float]:
+    """Moves ``x`` (n, 3) to equilibrium while the anchors' targets go there the straight ``way`` (a, 3) mm.
+
+    In steps of STEP_MM, in which cables are shortened, too. ``rows`` keeps the targets and lengths that were reached.
+    Returns whether the last step converged, the iterations, the steps, the residual mN, and the least share of a way
+    that was gone. Overwrites ``way``, ``excess`` (c,) mm, ``anchor_force`` (a, 3) and ``tension`` (c,) mN.
+    """
+    pull_points(x, rows, held)
+    set_penalties(base, rows, held)
+    far = 0.0
+    for a in range(len(way)):
+        far = max(far, length_across(rows.stiffness[a], way[a]))
+    for c in range(len(excess)):
+        far = max(far, held.stretch[c])
+    steps = min(max(math.ceil(far / STEP_MM), 1), MOST_STEPS)
+    most = steps * STEP_MM
+    reached = 1.0
+    for a in range(len(way)):
+        share = min(1.0, most / max(length_across(rows.stiffness[a], way[a]), 1e-300))
+        reached = min(reached, share)
+        for r in range(3):
+            rows.target[a, r] -= way[a, r]
+            way[a, r] *= share
+    for c in range(len(excess)):
+        excess[c] = max(held.stretch[c], 0.0)
+        rows.length[c] += excess[c]
+        if excess[c] > most:
+            reached = min(reached, most / excess[c])
+            excess[c] = most
+    converged, residual, iterations = False, 0.0, 0
+    for step in range(1, steps + 1):
+        for a in range(len(way)):
+            for r in range(3):
+                rows.target[a, r] += way[a, r] / steps
+        for c in range(len(excess)):
+            rows.length[c] -= excess[c] / steps
+        tolerance = tolerance_mN if step == steps else STEP_TOLERANCE * tolerance_mN
+        converged, used, residual = minimise(x, bodies, base, rows, held, memory, tolerance, max_iterations)
+        iterations += used
+    for a in range(len(way)):
+        for r in range(3):
+            anchor_force[a, r] = 0.0
+            for c in range(3):
+                off = rows.target[a, c] - held.point[rows.anchor_at[a], c]
+                anchor_force[a, r] += rows.stiffness[a, r, c] * off
+    for c in range(len(tension)):
+        tension[c] = max(0.0, held.multiplier[c] + held.penalty[c] * held.stretch[c])
+    return converged, iterations, steps, residual, reached
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def set_penalties(base: Base, rows: Rows, held: Held) -> None:
+    """Each cable's penalty from how far the tissue gives way to a unit of tension, d · K⁻¹ d."""
+    u = len(rows.slots)
+    for n in range(len(held.penalty)):
+        d = held.at
+        d[:] = 0.0
+        for k in range(rows.cable_start[n], rows.cable_start[n + 1]):
+            if rows.cable_at[k] >= 0:
+                for r in range(3):
+                    d[rows.cable_at[k], r] += held.row[k, r]
+        give = 0.0
+        for i in range(u):
+            for j in range(u):
+                for r in range(3):
+                    for c in range(3):
+                        give += d[i, r] * base.matrix[3 * rows.slots[i] + r, 3 * rows.slots[j] + c] * d[j, c]
+        held.penalty[n] = CABLE_PENALTY / give if give > 0.0 else 1.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def length_across(stiffness: Array, way: Array) -> float:
+    """How far mm a target that goes the ``way`` (3,) moves in the directions in which ``stiffness`` (3, 3) holds."""
+    norm = squared = 0.0
+    for r in range(3):
+        row = force = 0.0
+        for c in range(3):
+            row += abs(stiffness[r, c])
+            force += stiffness[r, c] * way[c]
+        norm = max(norm, row)
+        squared += force * force
+    return math.sqrt(squared) / norm if norm > 0.0 else 0.0

@@ -52,6 +52,17 @@ def at_points(values: Array, nodes: np.ndarray, weights: Array, out: Array) -> N
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def add_at_points(values: Array, nodes: np.ndarray, weights: Array, first: int, last: int, out: Array) -> None:
+    """Adds to ``out`` (u, 3) the means as of :func:`at_points`, of values that are zero outside the rows
+    ``first`` … ``last`` - 1."""
+    for i in range(len(nodes)):
+        for k in range(3):
+            if first <= nodes[i, k] < last:
+                for c in range(3):
+                    out[i, c] += weights[i, k] * values[nodes[i, k], c]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def spread(scale: float, values: Array, nodes: np.ndarray, weights: Array, out: Array) -> None:
     """Adds ``scale`` Wᵀ ``values``: shares the rows (u, 3) out to the nodes of ``out`` (n, 3)."""
     for i in range(len(nodes)):
@@ -78,14 +89,13 @@ def before_base(
     s: Array,
     y: Array,
     product: Array,
-    newest: int,
-    count: int,
+    newest: np.ndarray,
+    known: np.ndarray,
     matrix: Array,
     nodes: np.ndarray,
     weights: Array,
     awake: np.ndarray,
-    first: int,
-    last: int,
+    span: np.ndarray,
     moved: Array,
     pulled: Array,
     curvature: Array,
@@ -93,27 +103,35 @@ def before_base(
 ) -> None:
     """The first loop: overwrites the gradient ``q`` (n, 3), newest pair first.
 
-    ``s``, ``y`` (m, n, 3) hold the pairs in a ring that ends at ``newest``, and ``product`` (m, bodies) s · y of each
-    body. Overwrites ``moved``, ``pulled`` (m, u, 3), ``curvature`` and ``share`` (m,) for the second loop. A pair of no
-    positive curvature is passed over.
+    ``s``, ``y`` (m, n, 3) hold each body's pairs, in the rows ``span`` (bodies, 2) of its nodes, in a ring that ends at
+    ``newest`` (bodies,) and has ``known`` (bodies,) in it; ``product`` (bodies, m) is s · y. What is held may join the
+    bodies ``awake``: their pairs of one age are taken as one. Overwrites ``moved``, ``pulled`` (m, u, 3),
+    ``curvature`` and ``share`` (m,), by age, for the second loop. A pair of no positive curvature is passed over.
     """
     pairs = len(s)
-    for age in range(count):
-        k = (newest - age) % pairs
-        at_points(s[k], nodes, weights, moved[k])
-        multiply(matrix, moved[k], pulled[k])
+    for age in range(pairs):
+        moved[age] = 0.0
         c = 0.0
         for b in awake:
-            c += product[k, b]
+            if age < known[b]:
+                k = (newest[b] - age) % pairs
+                add_at_points(s[k], nodes, weights, span[b, 0], span[b, 1], moved[age])
+                c += product[b, k]
+        multiply(matrix, moved[age], pulled[age])
         for i in range(len(nodes)):
             for r in range(3):
-                c += moved[k, i, r] * pulled[k, i, r]
-        curvature[k] = c
-        share[k] = 0.0
-        if c > 0.0:
-            share[k] = dot(s[k], q, first, last) / c
-            add_scaled(-share[k], y[k], q, first, last)
-            spread(-share[k], pulled[k], nodes, weights, q)
+                c += moved[age, i, r] * pulled[age, i, r]
+        curvature[age] = c
+        if not c > 0.0:
+            continue
+        share[age] = 0.0
+        for b in awake:
+            if age < known[b]:
+                share[age] += dot(s[(newest[b] - age) % pairs], q, span[b, 0], span[b, 1]) / c
+        for b in awake:
+            if age < known[b]:
+                add_scaled(-share[age], y[(newest[b] - age) % pairs], q, span[b, 0], span[b, 1])
+        spread(-share[age], pulled[age], nodes, weights, q)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -157,12 +175,12 @@ def after_base(
     z: Array,
     s: Array,
     y: Array,
-    newest: int,
-    count: int,
+    newest: np.ndarray,
+    known: np.ndarray,
     nodes: np.ndarray,
     weights: Array,
-    first: int,
-    last: int,
+    awake: np.ndarray,
+    span: np.ndarray,
     pulled: Array,
     curvature: Array,
     share: Array,
@@ -170,13 +188,18 @@ def after_base(
 ) -> None:
     """The second loop: overwrites ``z`` (n, 3), oldest pair first."""
     pairs = len(s)
-    for age in range(count - 1, -1, -1):
-        k = (newest - age) % pairs
-        if not curvature[k] > 0.0:
+    for age in range(pairs - 1, -1, -1):
+        if not curvature[age] > 0.0:
             continue
         at_points(z, nodes, weights, point)
-        c = dot(y[k], z, first, last)
+        c = 0.0
         for i in range(len(nodes)):
             for r in range(3):
-                c += pulled[k, i, r] * point[i, r]
-        add_scaled(share[k] - c / curvature[k], s[k], z, first, last)
+                c += pulled[age, i, r] * point[i, r]
+        for b in awake:
+            if age < known[b]:
+                c += dot(y[(newest[b] - age) % pairs], z, span[b, 0], span[b, 1])
+        for b in awake:
+            if age < known[b]:
+                k = (newest[b] - age) % pairs
+                add_scaled(share[age] - c / curvature[age], s[k], z, span[b, 0], span[b, 1])

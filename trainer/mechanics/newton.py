@@ -1,0 +1,227 @@
+"""Static equilibrium of a link mesh by Newton's method, with a predictor along the way of the held nodes.
+
+Solves Σ F = 0 at every free node with the exact second derivatives H of the energy (``links``): H p = F. Where held
+nodes have moved by d, the first step is the tangent to the path of equilibria, H p = F - H_fh d, so that all nodes go
+along with them. A step along which H is not positive is taken with the blocks' positive part instead, which always
+leads down. Each further step is shortened until the energy falls (Armijo; Nocedal and Wright, Numerical Optimization,
+algorithms 3.1 and 7.1), so that the energy never rises but by rounding.
+
+The linear system is solved by ``SuperLU``, which factors again at each step and is the reference, or by
+``krylov.KeptFactorCG``, which does not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numba import njit
+from scipy.sparse import csc_matrix
+from scipy.sparse.linalg import splu
+
+from trainer.geometry import Array
+from trainer.mechanics.links import LinkMesh, add_forces, link_blocks
+
+#: Sufficient decrease (Armijo), and the shortest step tried.
+DECREASE, SHORTEST_STEP = 1e-4, 1e-6
+#: Share of an energy that is lost to rounding when it is summed over thousands of links.
+ROUNDING = 1e-14
+#: No node goes further in one step, in median links.
+LONGEST = 4.0
+#: The least accuracy of a linear solve, as a share of its right-hand side.
+FIRST_ACCURACY = 0.1
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a solve ended. Not converged: the state is finite, and its energy is lower than it was."""
+
+    converged: bool
+    steps: int  # Newton's, or sweeps
+    residual_mN: float  # Euclidean norm of the forces on the free nodes
+    energy: float  # mN mm
+
+
+class LinearSolver(Protocol):
+    """Solves with a mesh's stiffness, given by the block of each link, for the nodes that are free."""
+
+    def prepare(self, block: Array, free: np.ndarray) -> bool:
+        """Takes up the blocks (m, 3, 3) mN/mm and which nodes are free (n,) bool; both are still the caller's, who
+        changes them before the next call only. False when the matrix shows itself not to be positive definite."""
+
+    def solve(self, force: Array, accuracy: float, out: Array) -> bool:
+        """The step ``out`` (n, 3) mm, zero where not free, whose residual is at most ``accuracy`` of ``force`` (n, 3) mN,
+        which is zero where not free. False when the matrix shows itself not to be positive definite."""
+
+
+class SuperLU:
+    """The sparse LU factors of scipy (SuperLU), made anew for each matrix."""
+
+    def __init__(self, mesh: LinkMesh) -> None:
+        self._mesh = mesh
+
+    def prepare(self, block: Array, free: np.ndarray) -> bool:
+        self._free = np.flatnonzero(free)
+        dof = (3 * self._free[:, None] + np.arange(3)).ravel()
+        matrix = sparse_matrix(self._mesh, block)[dof][:, dof]
+        # A symmetric order, and pivots from the diagonal: then the signs on U's diagonal are those of the eigenvalues
+        # (Sylvester's law of inertia).
+        self._lu = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        return bool(np.array_equal(self._lu.perm_r, self._lu.perm_c) and np.all(self._lu.U.diagonal() > 0.0))
+
+    def solve(self, force: Array, accuracy: float, out: Array) -> bool:
+        out[:] = 0.0
+        out[self._free] = self._lu.solve(force[self._free].ravel()).reshape(-1, 3)
+        return True
+
+
+def sparse_matrix(mesh: LinkMesh, block: Array) -> csc_matrix:
+    """The stiffness (3 n, 3 n) mN/mm of the links' blocks (m, 3, 3), fixed nodes included."""
+    i, j = mesh.links.T.astype(np.int64)
+    row = 3 * np.concatenate([i, j, i, j])[:, None, None] + np.arange(3)[:, None]
+    column = 3 * np.concatenate([i, j, j, i])[:, None, None] + np.arange(3)
+    row, column = np.broadcast_arrays(row, column)
+    values = np.concatenate([block, block, -block, -block])
+    size = 3 * len(mesh.rest)
+    return csc_matrix((values.ravel(), (row.ravel(), column.ravel())), shape=(size, size))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def multiply(block: Array, links: np.ndarray, v: Array, out: Array) -> None:
+    """``out`` (n, 3) mN becomes the product of the links' stiffness with ``v`` (n, 3) mm."""
+    out[:] = 0.0
+    for e in range(len(links)):
+        i, j = links[e, 0], links[e, 1]
+        d0, d1, d2 = v[i, 0] - v[j, 0], v[i, 1] - v[j, 1], v[i, 2] - v[j, 2]
+        for c in range(3):
+            f = block[e, c, 0] * d0 + block[e, c, 1] * d1 + block[e, c, 2] * d2
+            out[i, c] += f
+            out[j, c] -= f
+
+
+class Newton:
+    """The state ``x`` (n, 3) mm of a mesh, some of whose nodes are moved; the others follow to equilibrium."""
+
+    def __init__(self, mesh: LinkMesh, solver: LinearSolver) -> None:
+        """Raises ValueError for a node that is neither fixed nor linked."""
+        refuse_loose_nodes(mesh)
+        self.mesh = mesh
+        self.x = mesh.rest.copy()
+        self._solver = solver
+        self._longest = float(np.median(mesh.rest_length))
+        self._block = np.zeros((len(mesh.links), 3, 3))
+        self._trial, self._step, self._way = (mesh.rest.copy() for _ in range(3))
+        self._force, self._trial_force = np.zeros_like(mesh.rest), np.zeros_like(mesh.rest)
+
+    def move(
+        self,
+        nodes: np.ndarray,
+        places: Array,
+        *,
+        tolerance_mN: float,
+        most_steps: int = 50,
+        load: Array | None = None,
+    ) -> Outcome:
+        """Moves ``nodes`` (k,) to ``places`` (k, 3) and all others to equilibrium under the forces ``load`` (n, 3) mN.
+
+        Raises ValueError when a place or a load is not finite.
+        """
+        refuse_not_finite(places, load)
+        x = self.x
+        load = np.zeros_like(x) if load is None else load
+        free = ~self.mesh.fixed
+        free[nodes] = False
+        energy = self._predict(nodes, places, free, load)
+        first = max(float(np.linalg.norm(self._force)), 1e-300)
+        for step in range(most_steps):
+            residual = float(np.linalg.norm(self._force))
+            if residual <= tolerance_mN:
+                return Outcome(True, step, residual, energy)
+            # Steps are solved for as exactly as pays: an inexact Newton method (Nocedal and Wright, section 7.1).
+            accuracy = max(min(FIRST_ACCURACY, residual / first), 0.1 * tolerance_mN / residual)
+            self._direction(free, accuracy)
+            lower = self._search(free, load, energy)
+            if lower is None:
+                return Outcome(False, step, residual, energy)
+            energy = lower
+        residual = float(np.linalg.norm(self._force))
+        return Outcome(residual <= tolerance_mN, most_steps, residual, energy)
+
+    def _predict(self, nodes: np.ndarray, places: Array, free: np.ndarray, load: Array) -> float:
+        """Moves the nodes, and all others along the tangent to the path of equilibria if that has less energy."""
+        x, way, trial = self.x, self._way, self._trial
+        way[:] = 0.0
+        way[nodes] = places - x[nodes]
+        trial[:] = x
+        if np.any(way):
+            self._evaluate(x, free, load, self._force)
+            link_blocks(x, self.mesh.links, self.mesh.rest_length, self.mesh.stiffness, False, self._block)
+            multiply(self._block, self.mesh.links, way, self._trial_force)
+            self._trial_force[~free] = 0.0
+            np.subtract(self._force, self._trial_force, out=self._trial_force)
+            if self._solver.prepare(self._block, free) and self._solver.solve(
+                self._trial_force, FIRST_ACCURACY, self._step
+            ):
+                trial += self._step
+            trial[nodes] = places
+        x[nodes] = places
+        energy = self._evaluate(x, free, load, self._force)
+        predicted = self._evaluate(trial, free, load, self._trial_force)
+        if predicted < energy:
+            x[:] = trial
+            self._force, self._trial_force = self._trial_force, self._force
+            energy = predicted
+        return energy
+
+    def _direction(self, free: np.ndarray, accuracy: float) -> None:
+        """Newton's step from ``x`` into ``_step``; it leads down."""
+        m = self.mesh
+        for project in (False, True):
+            link_blocks(self.x, m.links, m.rest_length, m.stiffness, project, self._block)
+            if (
+                self._solver.prepare(self._block, free)
+                and self._solver.solve(self._force, accuracy, self._step)
+                and float(np.vdot(self._force, self._step)) > 0.0
+            ):
+                return
+        self._step[:] = self._force / float(np.max(np.abs(self._block)))  # steepest descent
+
+    def _search(self, free: np.ndarray, load: Array, energy: float) -> float | None:
+        """Goes along ``_step`` as far as the energy falls enough; the new energy, or None if it nowhere does."""
+        slope = float(np.vdot(self._force, self._step))
+        noise = ROUNDING * (abs(energy) + float(np.sum(np.abs(load * self.x))))
+        t = min(1.0, LONGEST * self._longest / max(float(np.max(np.abs(self._step))), 1e-300))
+        while t >= SHORTEST_STEP:
+            np.multiply(self._step, t, out=self._trial)
+            self._trial += self.x
+            lower = self._evaluate(self._trial, free, load, self._trial_force)
+            if lower <= energy - DECREASE * t * slope + noise:
+                self.x[:] = self._trial
+                self._force, self._trial_force = self._trial_force, self._force
+                return lower
+            t *= 0.5
+        return None
+
+    def _evaluate(self, x: Array, free: np.ndarray, load: Array, force: Array) -> float:
+        """The energy at ``x`` (n, 3); ``force`` (n, 3) becomes what is unbalanced on the free nodes."""
+        m = self.mesh
+        force[:] = load
+        energy = add_forces(x, m.links, m.rest_length, m.stiffness, 0, len(m.links), force)
+        force[~free] = 0.0
+        return float(energy - np.vdot(load, x))
+
+
+def refuse_loose_nodes(mesh: LinkMesh) -> None:
+    """Raises ValueError for a node that is neither fixed nor linked: nothing says where it belongs."""
+    loose = np.flatnonzero(~mesh.fixed & (np.diff(mesh.start) == 0))
+    if len(loose):
+        raise ValueError(f"node {loose[0]} is neither fixed nor linked to another: fix it or remove it")
+
+
+def refuse_not_finite(places: Array, load: Array | None) -> None:
+    """Raises ValueError where a node is to be moved to no place, or drawn by no force."""
+    if not np.isfinite(places).all():
+        raise ValueError("a place to which a node is moved is not finite")
+    if load is not None and not np.isfinite(load).all():
+        raise ValueError("a load is not finite")
