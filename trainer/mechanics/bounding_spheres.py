@@ -5,8 +5,8 @@ once by dividing the elements along the longest side of their box; a node's sphe
 al. 2001, section 2.3, keep the tree when tissue deforms and only fit the spheres anew, from the leaves to the root.
 Two trees are compared from their roots down: where two spheres are apart, nothing below them is looked at.
 
-The tree is complete and kept as a heap: the children of node i are 2 i + 1 and 2 i + 2, the leaves are the last m nodes,
-so that refitting is one backward pass over an array.
+The tree is complete and kept as a heap: the children of node i are 2 i + 1 and 2 i + 2, the leaves are the last m
+nodes, so that refitting is one backward pass over an array.
 """
 
 from __future__ import annotations

@@ -53,9 +53,9 @@ def _search(  # type: ignore[no-untyped-def]
 class SelfContact:
     """Search for near pairs of ``segments`` (m, 2), which follow one another along one or more threads.
 
-    Segments up to ``neighbours`` places apart along a thread are no pair: 1 leaves out those that share a node. A segment
-    that does not begin where the one before ended begins a new thread. Raises ValueError for wrong shapes, and each
-    search does for places that are NaN, infinite or beyond 1e9 mm.
+    Segments up to ``neighbours`` places apart along a thread are no pair: 1 leaves out those that share a node. A
+    segment that does not begin where the one before ended begins a new thread. Raises ValueError for wrong shapes, and
+    each search does for places that are NaN, infinite or beyond 1e9 mm.
     """
 
     def __init__(self, segments: np.ndarray, neighbours: int = 1) -> None:
