@@ -17,7 +17,7 @@ from trainer.geometry import Array, Rigid, quaternion_from_axes, quaternion_from
 from trainer.instruments import forceps
 from trainer.instruments.needle import Needle, needle_point, needle_tangent
 from trainer.interactions import giving_way, goal, grasp, holding, pierce, thread_pull
-from trainer.interactions.world import Jaw, World, vector
+from trainer.interactions.world import Jaw, World
 from trainer.mechanics.equilibrium import Equilibrium
 from trainer.mechanics.thread import ThreadModel
 from trainer.poses import ToolPoses
@@ -34,18 +34,16 @@ def build(task: Task) -> Scene:
     """The scene at rest, with the instruments at home and the needle where the task has it held."""
     spec = task.scene
     world_from_scene = Rigid(np.array(spec.position_mm), quaternion_from_euler_deg(spec.rotation_deg))
-    homes = [
-        world_from_scene @ Rigid(np.array(i.home_mm), quaternion_from_euler_deg(i.home_rotation_deg))
-        for i in spec.instrument
-    ]
+    homes = [Rigid(np.array(i.home_mm), quaternion_from_euler_deg(i.home_rotation_deg)) for i in spec.instrument]
     world = World(
         task=task,
         tools=tuple(i.tool for i in spec.instrument),
         world_from_scene=world_from_scene,
+        scene_from_world=world_from_scene.inverse(),
         jaws=[Jaw(pose=h, closure=0.0) for h in homes],
     )
     if spec.vessel:
-        tissue = vessels.place(tuple(vessels.build(v) for v in spec.vessel), world_from_scene)
+        tissue = vessels.together(tuple(vessels.build(v) for v in spec.vessel))
         world.tissue = tissue
         world.solver = Equilibrium(tissue.mesh, tissue.orders())
         world.before = world.solver.x.copy()
@@ -73,7 +71,6 @@ def _hand_over_needle(world: World) -> None:
     """
     spec, needle = world.task.scene.needle, world.needle
     assert spec is not None and needle is not None
-    world.needle_pose = world.world_from_scene
     if not spec.held_by:
         return
     tool = world.tools.index(spec.held_by)
@@ -150,7 +147,7 @@ class Scene:
                 else:
                     jaw.lost_at = time_s
                     world.emit(TrackingLost, time_s, self.tools[i])
-            targets.append(poses.world_from_tool(i) if seen else jaw.pose)
+            targets.append(world.scene_from_world @ poses.world_from_tool(i) if seen else jaw.pose)
             closures[i] = poses.closure[i] if seen else jaw.closure
         return targets, closures
 
@@ -213,34 +210,39 @@ class Scene:
         world = self.world
         self.outcome, self.reason = outcome, reason
         world.emit(
-            TaskDone, time_s, "", outcome=outcome, reason=reason, needle_tip=vector(world.needle_pose.position),
-            needle_tangent=vector(world.needle_pose.rotate(np.array([1.0, 0.0, 0.0]))),
-            thread_end=vector(world.nodes[-1]) if world.thread is not None else (0.0, 0.0, 0.0),
+            TaskDone, time_s, "", outcome=outcome, reason=reason,
+            needle_tip=world.place_in_world(world.needle_pose.position),
+            needle_tangent=world.way_in_world(world.needle_pose.rotate(np.array([1.0, 0.0, 0.0]))),
+            thread_end=world.place_in_world(world.nodes[-1]) if world.thread is not None else (0.0, 0.0, 0.0),
             thread_length_error=thread_pull.stretch(world), tail_mm=thread_pull.tail_mm(world),
             gap_mm=goal.gap_mm(world),
         )  # fmt: skip
 
     def view(self) -> View:
         """What a trainee sees now."""
-        world = self.world
+        world, out = self.world, self.world.world_from_scene
         return View(
             tick=self.tick,
             time_s=self.tick / world.task.tick_hz,
             poses=self._poses(),
             look=self._look,
-            vessel_axis={v.spec.name: world.world_from_scene.rotate(v.axis) for v in self._vessels()},
-            world_from_needle=world.needle_pose if world.needle is not None else None,
+            vessel_axis={v.spec.name: out.rotate(v.axis) for v in self._vessels()},
+            world_from_needle=out @ world.needle_pose if world.needle is not None else None,
             needle_holders=tuple(
                 sorted((i for i, j in enumerate(world.jaws) if j.target == "needle"), key=lambda i: world.jaws[i].since)
             ),
             thread_holders=tuple(i for i, j in enumerate(world.jaws) if j.target == "thread"),
             holes=tuple(
                 HoleView(
-                    world.vessel_name(h.place), h.place.wall, "in" if h.inwards else "out", world.point(h.place), h.arc
+                    world.vessel_name(h.place),
+                    h.place.wall,
+                    "in" if h.inwards else "out",
+                    out.apply(world.point(h.place)),
+                    h.arc,
                 )
                 for h in world.open_holes()
             ),
-            thread=world.nodes.copy() if world.thread is not None else None,
+            thread=out.apply(world.nodes) if world.thread is not None else None,
             tail_mm=thread_pull.tail_mm(world),
             gap_mm=goal.gap_mm(world),
             steps_done=self.steps_done,
@@ -271,19 +273,20 @@ class Scene:
 
     def frame(self) -> Frame:
         """A copy of everything that moves."""
-        world = self.world
-        parts = [forceps.part_poses(j.pose, j.closure) for j in world.jaws]
+        world, out = self.world, self.world.world_from_scene
+        parts = [forceps.part_poses(out @ j.pose, j.closure) for j in world.jaws]
+        needle = out @ world.needle_pose if world.needle is not None else None
         return Frame(
             vertices=tuple(
-                world.solver.x[world.tissue.nodes(v)].copy()
+                out.apply(world.solver.x[world.tissue.nodes(v)])
                 for v in range(len(self._vessels()))
                 if world.tissue is not None and world.solver is not None
             ),
             part_position=np.concatenate([p for p, _ in parts]),
             part_quaternion=np.concatenate([q for _, q in parts]),
-            needle_position=world.needle_pose.position.copy() if world.needle is not None else None,
-            needle_quaternion=world.needle_pose.quaternion.copy() if world.needle is not None else None,
-            thread=tuple(thread_pull.drawn(world)),
+            needle_position=needle.position if needle is not None else None,
+            needle_quaternion=needle.quaternion if needle is not None else None,
+            thread=tuple(out.apply(piece) for piece in thread_pull.drawn(world)),
             force_mN=world.tissue_force_mN,
             tension_mN=world.tension_mN,
         )
@@ -293,9 +296,10 @@ class Scene:
 
     def _poses(self) -> ToolPoses:
         jaws = self.world.jaws
+        poses = [self.world.world_from_scene @ j.pose for j in jaws]
         return ToolPoses(
-            np.array([j.pose.position for j in jaws]),
-            np.array([j.pose.quaternion for j in jaws]),
+            np.array([pose.position for pose in poses]),
+            np.array([pose.quaternion for pose in poses]),
             np.array([j.closure for j in jaws]),
             np.array([j.seen for j in jaws]),
         )
@@ -309,7 +313,8 @@ class Scene:
         x = world.solver.x[world.tissue.nodes(index)]
         clock = math.radians(clock_deg)
         nodes, weights = vessels.wall_point(v, clock, axial_mm, "inner" if hull == "inner" else "outer")
-        return weights @ x[nodes], vessels.undented_normal(v, x, clock, axial_mm)
+        out = world.world_from_scene
+        return out.apply(weights @ x[nodes]), out.rotate(vessels.undented_normal(v, x, clock, axial_mm))
 
 
 def _part_way(a: Rigid, b: Rigid, share: float) -> Rigid:

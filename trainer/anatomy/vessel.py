@@ -12,13 +12,13 @@ axis, so that equal clock angles of two facing ends lie opposite each other.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from trainer.curriculum import VesselSpec
-from trainer.geometry import Array, Rigid, cross, fit_rotation, unit
+from trainer.geometry import Array, cross, fit_rotation, unit
 from trainer.mechanics.links import LinkMesh, link_mesh, stiffness_from_modulus
 
 Hull = Literal["outer", "inner"]
@@ -118,17 +118,16 @@ def build(spec: VesselSpec) -> Vessel:
     )
 
 
-def place(vessels: tuple[Vessel, ...], world_from_scene: Rigid) -> Tissue:
-    """The vessels as one mesh, set in the world. Rest lengths stay those of the scene frame, to the last bit."""
+def together(vessels: tuple[Vessel, ...]) -> Tissue:
+    """The vessels as one mesh."""
     offset = np.concatenate([[0], np.cumsum([len(v.mesh.rest) for v in vessels])])
     joined = link_mesh(
-        np.concatenate([world_from_scene.apply(v.mesh.rest) for v in vessels]),
+        np.concatenate([v.mesh.rest for v in vessels]),
         np.concatenate([v.mesh.links + o for v, o in zip(vessels, offset, strict=False)]),
         np.concatenate([v.mesh.stiffness for v in vessels]),
         np.concatenate([v.mesh.fixed for v in vessels]),
     )
-    lengths = np.concatenate([v.mesh.rest_length for v in vessels])
-    return Tissue(vessels, tuple(int(o) for o in offset), replace(joined, rest_length=lengths))
+    return Tissue(vessels, tuple(int(o) for o in offset), joined)
 
 
 def frame(axis: Array) -> tuple[Array, Array, Array]:

@@ -10,7 +10,7 @@ import numpy as np
 from trainer.events import Overforce, Tear
 from trainer.geometry import Array
 from trainer.interactions import grasp, pierce, thread_pull
-from trainer.interactions.world import Hole, World, vector
+from trainer.interactions.world import Hole, World
 from trainer.mechanics.attachments import Anchors, Cable
 from trainer.mechanics.equilibrium import Result
 
@@ -127,7 +127,7 @@ def _tear_worst(world: World, holes: list[tuple[Hole, float]], time_s: float) ->
     hole.torn = True
     world.emit(
         Tear, time_s, "", body=world.vessel_name(hole.place), wall=hole.place.wall, hole=hole.number,
-        point=vector(world.point(hole.place)), force_mN=load, limit_mN=limit,
+        point=world.place_in_world(world.point(hole.place)), force_mN=load, limit_mN=limit,
     )  # fmt: skip
 
 
@@ -150,8 +150,8 @@ def _judge_jaw(world: World, tool: int, load: float, time_s: float) -> None:
         wall = jaw.wall
         grasp.let_go(world, jaw)
         world.emit(
-            Tear, time_s, world.tools[tool], body=vessel.name, wall=wall, hole=-1, point=vector(jaw.pose.position),
-            force_mN=load, limit_mN=vessel.tear_mN.value,
+            Tear, time_s, world.tools[tool], body=vessel.name, wall=wall, hole=-1,
+            point=world.place_in_world(jaw.pose.position), force_mN=load, limit_mN=vessel.tear_mN.value,
         )  # fmt: skip
     elif load > limit:
         grasp.slip(world, tool, load, limit, time_s)

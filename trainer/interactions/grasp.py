@@ -14,7 +14,7 @@ from trainer.instruments.needle import needle_closest
 from trainer.interactions.crossing import nearest_on_surface
 from trainer.interactions.pierce import place_on
 from trainer.interactions.thread_pull import thread_point
-from trainer.interactions.world import Jaw, World, vector
+from trainer.interactions.world import Jaw, World
 
 #: Area of one jaw's tip on tissue, mm²: 0.1 mm wide and 0.3 mm deep (assumed).
 PAD_MM2 = 0.03
@@ -157,7 +157,7 @@ def _grasped(world: World, tool: int, body: str, arc: float, force: float, time_
     jaw = world.jaws[tool]
     world.emit(
         Grasp, time_s, world.tools[tool], target=jaw.target, body=body, arc_mm=arc,
-        point=vector(jaw.pose.position), force_mN=force,
+        point=world.place_in_world(jaw.pose.position), force_mN=force,
     )  # fmt: skip
 
 
@@ -167,7 +167,7 @@ def _dropped(world: World, target: str, time_s: float, tool: str) -> None:
         world.contact = None
     in_tissue = any(world.needle is not None and h.arc <= world.needle.length for h in world.open_holes())
     if target == "needle" and world.needle_tool() is None and not in_tissue:
-        world.emit(Drop, time_s, tool, target="needle", point=vector(world.needle_pose.position))
+        world.emit(Drop, time_s, tool, target="needle", point=world.place_in_world(world.needle_pose.position))
 
 
 def _body(world: World, jaw: Jaw) -> str:

@@ -17,7 +17,7 @@ from trainer.events import Contact, Pierce, PullThrough, Withdraw
 from trainer.geometry import Array, Rigid, cross, unit
 from trainer.instruments.needle import needle_closest, needle_point, needle_tangent
 from trainer.interactions.crossing import first_crossing, nearest_on_surface
-from trainer.interactions.world import Hole, Place, TipContact, World, vector
+from trainer.interactions.world import Hole, Place, TipContact, World
 
 #: A tip pushed hard but not along itself goes through as well, at this many puncture forces (assumed).
 SIDEWAYS = 2.0
@@ -55,7 +55,7 @@ def detect(world: World, before: Rigid, after: Rigid, start_s: float, span_s: fl
     point = before.position + fraction * (after.position - before.position)
     world.emit(
         Contact, now, tool, body=world.vessel_name(place), wall=place.wall,
-        direction="in" if inwards else "out", point=vector(point), axial_mm=place.axial_mm,
+        direction="in" if inwards else "out", point=world.place_in_world(point), axial_mm=place.axial_mm,
         clock_deg=math.degrees(place.clock),
     )  # fmt: skip
 
@@ -110,8 +110,8 @@ def puncture(world: World, before: Rigid, after: Rigid, force: Array, start_s: f
     world.emit(
         Pierce, start_s + share * span_s, tool, body=world.vessel_name(hole.place), wall=hole.place.wall,
         direction="in" if hole.inwards else "out", pass_number=hole.pass_number, hole=hole.number,
-        point=vector(tip), axial_mm=hole.place.axial_mm, clock_deg=math.degrees(hole.place.clock),
-        tangent=vector(heading), normal=vector(upright),
+        point=world.place_in_world(tip), axial_mm=hole.place.axial_mm, clock_deg=math.degrees(hole.place.clock),
+        tangent=world.way_in_world(heading), normal=world.way_in_world(upright),
         entry_angle_deg=math.degrees(math.asin(min(1.0, abs(float(heading @ upright))))),
         force_mN=limit if along >= limit else along, depth_mm=float((surface - tip) @ upright),
     )  # fmt: skip

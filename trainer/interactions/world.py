@@ -1,5 +1,8 @@
 """The state that the rules of interaction share, and how a rule writes an event.
 
+All of it is in the scene's own frame: where a teacher puts the scene in the world changes no bit of what happens in
+it. Poses come in, and events, views and frames go out, in the frame of the world.
+
 A component that the task does not ask for is None. Models are frozen; what changes lives here.
 """
 
@@ -89,6 +92,7 @@ class World:
     task: Task
     tools: tuple[str, ...]
     world_from_scene: Rigid
+    scene_from_world: Rigid
     jaws: list[Jaw]
     tissue: Tissue | None = None
     solver: Equilibrium | None = None
@@ -113,6 +117,14 @@ class World:
     def emit(self, cls: type[Event], time_s: float, tool: str, **values: Any) -> None:
         """Write an event of this tick."""
         self.events.append(cls(tick=self.tick, seq=len(self.events), time_s=time_s, tool=tool, **values))
+
+    def place_in_world(self, point: Array) -> tuple[float, float, float]:
+        """A point (3,) mm of the scene as an event stores it."""
+        return vector(self.world_from_scene.apply(point))
+
+    def way_in_world(self, direction: Array) -> tuple[float, float, float]:
+        """A direction (3,) of the scene as an event stores it."""
+        return vector(self.world_from_scene.rotate(direction))
 
     def open_holes(self) -> list[Hole]:
         return [h for h in self.holes if h.open]
