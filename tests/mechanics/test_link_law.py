@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -59,7 +60,7 @@ def driven(path: Array, law: tuple[float, float, float, float, float]) -> tuple[
     Simpson's rule on each part of the path, the slip being that of the part's beginning.
     """
     slip, work, seen = 0.0, 0.0, []
-    for a, b in zip(path[:-1], path[1:], strict=True):
+    for a, b in pairwise(path):
         ta, tm, tb = (tension_and_tangent(e, slip, *law)[0] for e in (a, 0.5 * (a + b), b))
         work += (b - a) * (ta + 4.0 * tm + tb) / 6.0
         slip = slip_at(b, slip, *law)
@@ -69,17 +70,19 @@ def driven(path: Array, law: tuple[float, float, float, float, float]) -> tuple[
 
 @given(law=laws, elongation=elongations, slip=elongations)
 def test_the_tangent_is_the_tensions_derivative(law: tuple[float, ...], elongation: float, slip: float) -> None:
-    """A central difference over ±d errs by d² T''' / 6 <= d² β² κ / 6, plus rounding 2e-16 T / d.
+    """A difference quotient over ±d is a mean of the tangents there, so it lies within their spread of each of them.
 
-    d = 1e-5 mm, β <= 10 / mm: relative to the steepest tangent 2e-9; T <= 10 e^5 · 1 mN, over d: 3e-8 mN/mm of
-    rounding against κ >= 0.1, 3e-7. At a kink, where a friction limit is met or the toe ends, there is no derivative.
+    Where there is no kink the spread is a factor exp(2 β d) = 1 + 2e-4, at most; kinks (a friction limit is met, the
+    toe ends) and a friction branch that is shorter than 3 d are left out. Rounding, 2e-16 T / d, is 1e-10 of κ.
     """
     d = 1e-5
+    k, growth, toe, loss, friction = law
+    assume(loss == 0.0 or elongation < -d or loss * loading(elongation, k, growth, toe)[0] > 3.0 * d * friction)
     tangents = [tension_and_tangent(elongation + s * d, slip, *law)[1] for s in (-1.0, 0.0, 1.0)]
-    # Between d and d apart the tangent grows by at most a factor exp(β d) = 1 + 1e-4 where there is no kink.
-    assume(max(tangents) - min(tangents) <= 1.1e-4 * law[4])
+    spread = max(tangents) - min(tangents)
+    assume(spread <= 2.1e-4 * min(tangents))
     up, down = (tension_and_tangent(elongation + s * d, slip, *law)[0] for s in (1.0, -1.0))
-    assert (up - down) / (2.0 * d) == pytest.approx(tangents[1], abs=1e-6 * law[4])
+    assert (up - down) / (2.0 * d) == pytest.approx(tangents[1], abs=spread + 1e-9 * friction)
 
 
 @given(law=laws, elongation=elongations)
@@ -90,7 +93,7 @@ def test_the_area_is_the_tensions_integral(law: tuple[float, ...], elongation: f
     nodes, weights = np.polynomial.legendre.leggauss(20)
     whole = 0.0
     cuts = sorted({0.0, *(c for c in (toe, elongation) if 0.0 <= c <= elongation), elongation})
-    for a, b in zip(cuts[:-1], cuts[1:], strict=True):
+    for a, b in pairwise(cuts):
         at = 0.5 * (a + b) + 0.5 * (b - a) * nodes
         whole += 0.5 * (b - a) * sum(w * loading(e, k, growth, toe)[0] for e, w in zip(at, weights, strict=True))
     assert area(elongation, k, growth, toe) == pytest.approx(abs(whole), rel=1e-12, abs=1e-300)
@@ -213,7 +216,9 @@ def test_the_toe_is_that_of_a_ligament() -> None:
     law has the form that the authors chose, not that they chose well.
     """
     with REAL.open(encoding="utf-8") as file:
-        rows = [(float(r["strain_percent"]) / 100.0, float(r["stress_MPa_10pct_per_min"])) for r in csv.DictReader(file)]
+        rows = [
+            (float(r["strain_percent"]) / 100.0, float(r["stress_MPa_10pct_per_min"])) for r in csv.DictReader(file)
+        ]
     table = {strain: stress for strain, stress in rows if stress > 0.0}
     growth = math.log(table[0.04] / table[0.02] - 1.0) / 0.02
     k = table[0.02] * growth / math.expm1(0.02 * growth)

@@ -107,7 +107,7 @@ def lumped_masses(rest: Array, tetrahedra: np.ndarray, density: float) -> Array:
     functions, ∫ ρ N_a N_b dV = ρ V (1 + δ_ab) / 20 (Zienkiewicz & Taylor). Total mass and centre of mass are kept.
     """
     share = 0.25 * density * tetrahedron_volumes(rest, tetrahedra)
-    return np.bincount(tetrahedra.ravel(), weights=np.repeat(share, 4), minlength=len(rest))
+    return _at_nodes(tetrahedra, share, len(rest))
 
 
 def masses_of_links(mesh: LinkMesh, modulus_kPa: float, density: float) -> Array:
@@ -117,7 +117,12 @@ def masses_of_links(mesh: LinkMesh, modulus_kPa: float, density: float) -> Array
     the sum of k L² over a node's links is 3 E times the volume around it.
     """
     share = density / (12.0 * modulus_kPa) * mesh.stiffness * mesh.rest_length**2
-    return np.bincount(mesh.links.ravel(), weights=np.repeat(share, 2), minlength=len(mesh.rest))
+    return _at_nodes(mesh.links, share, len(mesh.rest))
+
+
+def _at_nodes(parts: np.ndarray, share: Array, n: int) -> Array:
+    """The sums (n,) of the shares (p,) of all parts (p, k) at a node."""
+    return np.asarray(np.bincount(parts.ravel(), np.repeat(share, parts.shape[1]), n), dtype=np.float64)
 
 
 class Bounds(NamedTuple):
@@ -154,12 +159,12 @@ def _spectral_bound(links: np.ndarray, weight: Array, mass: Array, free: np.ndar
     """A number that no eigenvalue of M⁻¹ L on the free nodes exceeds, L the Laplacian of links of ``weight`` (m,)."""
     n = len(mass)
     i, j = links.T
-    total = np.bincount(links.T.ravel(), weights=np.tile(weight, 2), minlength=n)
+    total = _at_nodes(links, weight, n)
     inverse = np.divide(1.0, mass, out=np.zeros(n), where=free)
     w = np.where(free, 1.0, 0.0)
     best = math.inf
     for _ in range(SHARPENINGS):
-        across = np.bincount(i, weights=weight * w[j], minlength=n) + np.bincount(j, weights=weight * w[i], minlength=n)
+        across = np.bincount(i, weight * w[j], n) + np.bincount(j, weight * w[i], n)
         image = inverse * (total * w + across)
         best = min(best, float(np.max(image[free] / w[free])))
         w = image + best * w

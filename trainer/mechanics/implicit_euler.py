@@ -305,9 +305,8 @@ class BackwardEuler:
             raise ValueError(f"'newton_steps' must be at least 1, found {newton_steps}")
         self.model, self.tolerance_mN, self.newton_steps = model, tolerance_mN, newton_steps
         n, m = len(model.mass), len(model.links)
-        arrays = [np.zeros((n, 3)) for _ in range(8)]
-        old = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(m)
-        self._solve = Solve(*arrays, np.zeros((m, 6)), np.zeros((n, 6)), *old)
+        by_node, old = np.zeros((8, n, 3)), np.zeros((2, n, 3))
+        self._solve = Solve._make([*by_node, np.zeros((m, 6)), np.zeros((n, 6)), *old, np.zeros(m)])
 
     def step(self, state: State, duration: float) -> int:
         """Moves ``state`` on by ``duration`` s, in place; returns the number of substeps.
