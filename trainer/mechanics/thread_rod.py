@@ -15,12 +15,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from trainer.geometry import Array
-from trainer.mechanics.thread_rod_newton import Contacts, Law, Work, solve
-from trainer.mechanics.thread_rod_solve import BAND, WIDTH
-from trainer.mechanics.thread_rod_step import advance
+from trainer.mechanics.thread_rod_newton import NEAR, Contacts, Law, Work, solve
+from trainer.mechanics.thread_rod_solve import BAND, WIDTH, directions
+from trainer.mechanics.thread_rod_step import SLIPS_AT, advance, carry_frame
 
 #: Kinematic viscosity, mm²/s, and dynamic viscosity, mN s/mm², of air at 20 °C (US Standard Atmosphere 1976, eq. 51).
 AIR_KINEMATIC, AIR_DYNAMIC = 15.0, 1.81e-8
+FIRST_FIRMNESS = 1e4  # 1/s²: the first step to an equilibrium gives way as inertia does in 10 ms; decides time only
+MOST_FADES = 2000
+LEAST_SHARE = 1e-4
+AT_REST = 1e-9  # lengths of the rod: a step to an equilibrium that moves no node further is the last
 
 
 class RodStalled(ArithmeticError):
@@ -162,7 +166,8 @@ def begin(model: RodModel, x: ArrayLike, v: ArrayLike | None = None, frame: Arra
     """A rod at places ``x`` (n, 3) mm with speeds ``v`` (n, 3) mm/s, at rest if not given.
 
     ``frame`` (3,) says what is across the first link (made exactly so); by default the plane of the first bend.
-    Links need not have their length: the first step or ``settle`` restores it. Raises ValueError for wrong shapes or
+    A link that has not its length gets it along its direction (+x, or that of the link before, if it has none): node
+    0 stays, and what is held elsewhere is drawn to its target by the first step. Raises ValueError for wrong shapes or
     numbers that are not finite.
     """
     n = model.count
@@ -177,10 +182,14 @@ def begin(model: RodModel, x: ArrayLike, v: ArrayLike | None = None, frame: Arra
             raise ValueError("the frame must not lie along the first link")
         across = given / np.linalg.norm(given)
     law = model.law()
+    t, size = np.zeros((n, 3)), np.zeros(n)
+    directions(places, t, size)
+    if np.max(np.abs(size[1:] - model.link)) > 1e-9 * model.link:
+        places[1:] = places[0] + np.cumsum(model.link * t[1:], axis=0)
     work = Work(
         np.zeros((n, 3)), np.zeros(n), np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((4 * n + BAND, WIDTH)),
         np.zeros(4 * n + BAND), np.zeros((n, 3)), np.zeros(n), np.zeros((n, 3)), places.copy(), np.zeros(n),
-        np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n, dtype=np.bool_),
+        np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n, dtype=np.bool_), np.zeros(n), np.zeros((n, 3)),
     )  # fmt: skip
     load = law.mass[:, None] * np.array(model.gravity)
     return RodState(
@@ -195,6 +204,7 @@ class Holds:
     node: NDArray[np.int32]  # (k,) each once
     target: Array  # (k, 3) mm at the end of the tick
     limit: Array  # (k,) mN: what a hold can bear; past it the node lags behind its target, drawn by this force
+    slips: NDArray[np.bool_]  # (k,) whether the limit was reached in the last tick
     bears: Array  # (k, 3) mN the force of the hold on the rod at the end of the last tick
 
 
@@ -211,12 +221,10 @@ def holds(model: RodModel, node: ArrayLike, target: ArrayLike, limit: ArrayLike 
     if not (limits >= 0.0).all():
         raise ValueError("a hold's limit must be 0 mN or more")
     places = _finite("targets", np.asarray(target, dtype=np.float64).reshape(-1, 3), (len(nodes), 3)).copy()
-    return Holds(nodes, places, limits, np.zeros((len(nodes), 3)))
+    return Holds(nodes, places, limits, np.zeros(len(nodes), dtype=np.bool_), np.zeros((len(nodes), 3)))
 
 
-def step(
-    state: RodState, held: Holds, tick: float, tolerance: float = 0.0, contacts: Contacts | None = None
-) -> None:
+def step(state: RodState, held: Holds, tick: float, tolerance: float = 0.0, contacts: Contacts | None = None) -> None:
     """Let ``tick`` s pass. ``tolerance`` mm: the error a substep may make, 0 for one substep a tick.
 
     ``state.tension`` and ``held.bears`` say afterwards what the links and holds bear. With ``contacts`` (of
@@ -233,8 +241,85 @@ def step(
         raise ValueError("a load on the rod is not finite")
     advance(
         state._law, state._work, state.load, state.x, state.v, state._x_before, state._v_before, state.tension,
-        state._clock, state.frame, held.node, held.target, held.limit, held.bears,
+        state._clock, state.frame, held.node, held.target, held.limit, held.slips, held.bears,
         state._none if contacts is None else contacts, tick, tolerance, state.outcome,
     )  # fmt: skip
     if state.outcome[3] != 0.0:
         raise RodStalled("no substep of the thread converged")
+
+
+@dataclass(frozen=True)
+class Settled:
+    """How ``settle`` ended."""
+
+    residual: float  # mN, the largest force that is left at a free node
+    iterations: int
+
+
+def settle(state: RodState, held: Holds, contacts: Contacts | None = None) -> Settled:
+    """Bring the rod to rest: the equilibrium of bending, weight and holds that lies downhill of where it is.
+
+    Proximal point steps (Rockafellar 1976, "Monotone operators and the proximal point algorithm"): each is the
+    minimum of the energy plus ½ weight |x - before|², so that none goes uphill, and the weights fade eightfold
+    from one to the next, until Newton's own convergence is left. A hold that would bear more than its limit lets its
+    node go with that force. Speeds become 0. Raises ValueError for targets or loads that are not finite,
+    RodStalled where no equilibrium is found: nothing holds a rod that falls, for example.
+    """
+    if not (np.isfinite(held.target).all() and np.isfinite(state.load).all()):
+        raise ValueError("a hold's target or a load on the rod is not finite")
+    law, work = state._law, state._work
+    touching = state._none if contacts is None else contacts
+    length = law.link * (len(state.x) - 1)
+    before, tension = state.x.copy(), state.tension.copy()
+    work.force[:] = state.load
+    work.held[:] = False
+    work.held[held.node] = True
+    loose = held.slips
+    loose[:] = False
+    work.pull[:] = 0.0
+    work.aim[held.node] = held.target
+    firmness = FIRST_FIRMNESS
+    share = 1.0  # of the way to the targets
+    iterations = 0
+    for _ in range(MOST_FADES):
+        work.weight[:] = firmness * law.mass
+        work.y[:] = work.begin[:] = work.x[:] = before
+        work.x[held.node[~loose]] += share * (held.target - before[held.node])[~loose]
+        work.tension[:] = tension
+        spent = solve(law, work, state.frame, touching, 1.0, 1.0)
+        iterations += abs(spent)
+        if spent < 0:
+            share *= 0.25
+            touching.push[:] = 0.0
+            touching.grip[:] = 0.0
+            if share < LEAST_SHARE:
+                break
+            continue
+        carry_frame(law, before, work.x, state.frame)
+        moved = work.x - before
+        before, tension = work.x.copy(), work.tension.copy()
+        held.bears[~loose] = -work.left[held.node[~loose]]
+        drawn = held.node[loose]
+        towards = held.target[loose] - work.x[drawn]
+        far = np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), NEAR * law.link)
+        held.bears[loose] = work.pull[drawn, None] * towards / far
+        excess = np.linalg.norm(held.bears, axis=1) - SLIPS_AT * held.limit
+        if len(excess) and np.max(excess[~loose], initial=-1.0) > 0.0 and firmness < 1e-3 * FIRST_FIRMNESS:
+            worst = int(np.argmax(np.where(loose, -1.0, excess)))
+            loose[worst] = True
+            work.held[held.node[worst]] = False
+            work.pull[held.node[worst]] = held.limit[worst]
+            firmness = FIRST_FIRMNESS
+            continue
+        if share < 1.0:
+            share = min(2.0 * share, 1.0)
+            continue
+        furthest = float(np.max(np.abs(moved)))
+        if furthest <= AT_REST * length and firmness < 1e-3 * FIRST_FIRMNESS:
+            state.x[:], state.tension[:] = before, tension
+            state._x_before[:] = before
+            state.v[:] = state._v_before[:] = 0.0
+            state._clock[:] = 0.0
+            return Settled(float(np.max(np.abs(work.weight[:, None] * moved)[~work.held], initial=0.0)), iterations)
+        firmness /= 8.0
+    raise RodStalled("the thread found no equilibrium from here")

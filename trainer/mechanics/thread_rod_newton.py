@@ -37,6 +37,8 @@ MOST_CONTACT_ITERATIONS = 150
 CLOSE = 1e-5  # link lengths: an iteration that moves no node further is the last; what it leaves is of second order
 STIFF = 20.0  # a contact's k over the stiffness of the nodes it acts on; decides iterations, not the answer
 
+NEAR = 1e-3  # links: a slipping hold this close to its place has caught it
+
 
 class Law(NamedTuple):
     """What the rod is, per node. All (n, ...) float64."""
@@ -53,7 +55,7 @@ class Law(NamedTuple):
 class Contacts(NamedTuple):
     """Where the rod may touch. A row is a contact; ``thread_contact`` fills them. Capacity m."""
 
-    count: NDArray[np.int64]  # (1,) rows in use
+    used: NDArray[np.int64]  # (1,) rows in use
     link: NDArray[np.int32]  # (m,) first node of the link
     other: NDArray[np.int32]  # (m,) first node of the other link, or -1 for an obstacle
     place: Array  # (m, 2) where along the link, and along the other, 0..1
@@ -83,6 +85,8 @@ class Work(NamedTuple):
     came: Array  # (n, 3) mm, where inertia alone would bring the node
     begin: Array  # (n, 3) mm, places at the start of the problem
     held: NDArray[np.bool_]  # (n,)
+    pull: Array  # (n,) mN with which a slipping hold draws its node
+    aim: Array  # (n, 3) mm where to
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -93,7 +97,7 @@ def _point(x: Array, contacts: Contacts, k: int, c: int) -> float:
     if j >= 0:
         s = contacts.place[k, 1]
         p -= (1.0 - s) * x[j, c] + s * x[j + 1, c]
-    return p
+    return float(p)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -124,7 +128,7 @@ def _touch(x: Array, begin: Array, contacts: Contacts, moved: float, part: float
 def _add_contacts(x: Array, contacts: Contacts, moved: float, part: float, work: Work, first: bool) -> None:
     """Forces of the contacts into ``work.left`` and their stiffness into the matrix."""
     a, left = work.a, work.left
-    for k in range(contacts.count[0]):
+    for k in range(contacts.used[0]):
         i, j = contacts.link[k], contacts.other[k]
         if first:
             stiff = max(a[4 * i, 0], a[4 * i + 4, 0])
@@ -155,10 +159,27 @@ def _add_contacts(x: Array, contacts: Contacts, moved: float, part: float, work:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _add_pulls(x: Array, work: Work, link: float) -> None:
+    """Forces of slipping holds towards their places: whole from ``NEAR`` links off, a spring nearer than that."""
+    for i in range(len(x)):
+        if work.pull[i] > 0.0:
+            r = (work.aim[i, 0] - x[i, 0], work.aim[i, 1] - x[i, 1], work.aim[i, 2] - x[i, 2])
+            size2 = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
+            away = math.sqrt(size2) > NEAR * link
+            k = work.pull[i] / (math.sqrt(size2) if away else NEAR * link)
+            for c in range(3):
+                work.left[i, c] += k * r[c]
+                for e in range(c, 3):
+                    work.a[4 * i + c, e - c] += k * (1.0 if c == e else 0.0)
+                    if away:
+                        work.a[4 * i + c, e - c] -= k * r[c] * r[e] / size2
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _update_contacts(x: Array, contacts: Contacts, moved: float, part: float, begin: Array) -> float:
     """New multipliers; returns the largest change of one, as the way in mm that its k makes of it."""
     worst = 0.0
-    for k in range(contacts.count[0]):
+    for k in range(contacts.used[0]):
         push, fx, fy, fz, _ = _touch(x, begin, contacts, moved, part, k)
         change = abs(push - contacts.push[k])
         change = max(change, abs(fx - contacts.grip[k, 0]))
@@ -179,23 +200,17 @@ def solve(law: Law, work: Work, frame: Array, contacts: Contacts, moved: float, 
     """
     x, tension = work.x, work.tension
     n = len(x)
-    touching = contacts.count[0] > 0
+    touching = contacts.used[0] > 0
     for iteration in range(1, (MOST_CONTACT_ITERATIONS if touching else MOST_ITERATIONS) + 1):
         directions(x, work.t, work.size)
         if law.curved:
             rest_bends(x, frame, law.curvature, law.link, work.t, work.rest)
-        imbalance(x, tension, work.y, work.weight, work.force, law.bend, work.rest, work.t, work.left)
         for compression in range(2):
-            assemble(
-                tension, work.weight, law.bend, law.stretch, law.link, work.t, work.size, compression == 0, work.a
-            )
+            imbalance(x, tension, work.y, work.weight, work.force, law.bend, work.rest, work.t, work.left)
+            assemble(tension, work.weight, law.bend, law.stretch, law.link, work.t, work.size, compression == 0, work.a)
             if touching:
-                if compression == 1:
-                    for i in range(n):
-                        for c in range(3):
-                            work.left[i, c] = 0.0
-                    imbalance(x, tension, work.y, work.weight, work.force, law.bend, work.rest, work.t, work.left)
                 _add_contacts(x, contacts, moved, part, work, iteration == 1)
+            _add_pulls(x, work, law.link)
             hold(work.held, work.a)
             if factor(work.a, 4 * n):
                 break
