@@ -1,9 +1,14 @@
-"""Conjugate gradients with a kept multifrontal factor as preconditioner (Nocedal and Wright, algorithm 5.3).
+"""Newton's method for big meshes: conjugate gradients over a kept factor, in a region of trust.
 
 A factor of an earlier stiffness answers most of a new one: the two differ where the mesh has turned or stretched since,
-which is near the instrument. The iterations that this takes are counted; when they would have paid for a new factor, a
-new one is made. Held nodes do not change the factor, which is of all nodes that are not fixed for good: its inverse
-restricted to the others is
+which is near the instrument. So Newton's equation is solved by conjugate gradients with the exact second derivatives
+and the old factor M as preconditioner. Where the energy curves down, or the step gets longer than the quadratic model
+deserves trust, the step ends at the border of the region |p|_M <= radius (Steihaug 1983, SIAM J. Numer. Anal. 20:626;
+Nocedal and Wright, Numerical Optimization, algorithms 4.1 and 7.2). A step that does not lower the energy is not taken,
+so that the energy never rises but by rounding. Iterations are counted, and many ask for a new factor.
+
+Held nodes do not change the factor, which is of all nodes that are not fixed for good. Its inverse restricted to the
+others is
 
     K_ff⁻¹ r = K⁻¹ r - K⁻¹ E (Eᵀ K⁻¹ E)⁻¹ Eᵀ K⁻¹ r
 
@@ -12,73 +17,188 @@ with the unit columns E of the held nodes' coordinates.
 
 from __future__ import annotations
 
+import math
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 
 from trainer.geometry import Array
 from trainer.mechanics import multifrontal
-from trainer.mechanics.links import LinkMesh, blocks
-from trainer.mechanics.multifrontal import Multifrontal
+from trainer.mechanics.links import LinkMesh, add_forces, blocks, link_blocks
+from trainer.mechanics.multifrontal import Multifrontal, MultifrontalFactor
 from trainer.mechanics.nested_dissection import dissect
-from trainer.mechanics.newton import multiply
+from trainer.mechanics.newton import Outcome, multiply, refuse_loose_nodes, refuse_not_finite
 
-#: More iterations than this in one solve ask for a new factor.
+#: More iterations than this in one step ask for a new factor.
 SLOW = 30
-#: Iterations after which a solve ends as it is.
-MOST = 400
+#: Iterations after which a step ends as it is.
+MOST = 200
+#: The least accuracy of a linear solve, as a share of its right-hand side.
+FIRST_ACCURACY = 0.1
+#: Share of the predicted decrease that a step must bring; and those below and above which the region changes.
+TAKEN, POOR, GOOD = 1e-4, 0.25, 0.75
+#: Share of an energy that is lost to rounding when it is summed over thousands of links.
+ROUNDING = 1e-14
+#: No node goes further in one step than this, in median links.
+LONGEST = 2.0
 
 
-class KeptFactorCG:
-    """A ``newton.LinearSolver`` for one mesh; the first factor is of its rest state."""
+class Scratch(NamedTuple):
+    """Arrays of one mesh that the kernels overwrite."""
+
+    r: Array  # (n, 3)
+    z: Array  # (n, 3)
+    p: Array  # (n, 3)
+    q: Array  # (n, 3)
+    v: np.ndarray  # (3 f,) float32
+    w: np.ndarray  # (longest row of a panel,) float32
+
+
+class NewtonKrylov:
+    """The state ``x`` (n, 3) mm of a mesh, some of whose nodes are moved; the others follow to equilibrium."""
 
     def __init__(self, mesh: LinkMesh) -> None:
-        """Raises ValueError when the links do not hold all free nodes in place."""
-        self._mesh = mesh
+        """Raises ValueError for a node that is neither fixed nor linked, or when the links leave nodes free to move."""
+        refuse_loose_nodes(mesh)
+        self.mesh = mesh
+        self.x = mesh.rest.copy()
+        self.iterations = 0  # of conjugate gradients, so far
+        self.factors = 1  # made so far
         self._factoring = Multifrontal(mesh.links, dissect(mesh))
-        if not self._factoring.compute(blocks(mesh, mesh.rest)):
+        self._block = blocks(mesh, mesh.rest)
+        if not self._factoring.compute(self._block):
             raise ValueError("the links do not hold all free nodes in place: the stiffness matrix is singular")
-        self.iterations = 0  # in all solves
-        self.factors = 1  # made
         self._slow = False
+        self._free = ~mesh.fixed
         self._held = np.zeros(0, dtype=np.int64)
         self._columns = np.zeros((0, *mesh.rest.shape))
         self._inverse = np.zeros((0, 0))
-        self._scratch = np.zeros((4, *mesh.rest.shape))
+        self._longest = LONGEST * float(np.median(mesh.rest_length))
+        self._trial, self._step, self._way = (np.zeros_like(mesh.rest) for _ in range(3))
+        self._force, self._trial_force = np.zeros_like(mesh.rest), np.zeros_like(mesh.rest)
+        r, z, p, q = (np.zeros_like(mesh.rest) for _ in range(4))
+        self._scratch = Scratch(r, z, p, q, *self._factoring.scratch)
 
-    def prepare(self, block: Array, free: np.ndarray) -> bool:
-        self._block, self._free = block, free
+    def move(
+        self,
+        nodes: np.ndarray,
+        places: Array,
+        *,
+        tolerance_mN: float,
+        most_steps: int = 100,
+        load: Array | None = None,
+    ) -> Outcome:
+        """Moves ``nodes`` (k,) to ``places`` (k, 3) and all others to equilibrium under the forces ``load`` (n, 3) mN.
+
+        Raises ValueError when a place or a load is not finite.
+        """
+        refuse_not_finite(places, load)
+        load = np.zeros_like(self.x) if load is None else load
+        self._hold(nodes)
+        energy = self._predict(nodes, places, load)
+        first = residual = float(np.linalg.norm(self._force))
+        radius = math.inf
+        for step in range(most_steps):
+            if residual <= tolerance_mN:
+                return Outcome(True, step, residual, energy)
+            self._update()
+            accuracy = max(min(FIRST_ACCURACY, residual / first), 0.1 * tolerance_mN / residual)
+            decrease, length, cut = self._solve(self._force, accuracy, radius)
+            np.add(self.x, self._step, out=self._trial)
+            lower = self._evaluate(self._trial, load, self._trial_force)
+            noise = ROUNDING * (abs(energy) + float(np.sum(np.abs(load * self.x))))
+            trial_residual = float(np.linalg.norm(self._trial_force))
+            share = (energy - lower) / decrease if decrease > 0.0 else -1.0
+            if decrease <= 100.0 * noise and lower <= energy + noise and trial_residual < residual:
+                share = 1.0  # the energies' difference is below their rounding: the forces tell
+            if share < POOR:
+                radius = POOR * length
+            elif share > GOOD and cut:
+                radius = 2.0 * length
+            if share > TAKEN:
+                self.x[:] = self._trial
+                self._force, self._trial_force = self._trial_force, self._force
+                energy, residual = lower, trial_residual
+            elif length == 0.0 or decrease <= noise:
+                return Outcome(False, step, residual, energy)
+        return Outcome(residual <= tolerance_mN, most_steps, residual, energy)
+
+    def _hold(self, nodes: np.ndarray) -> None:
+        """Takes ``nodes`` (k,) out of the unknowns."""
+        self._free[:] = ~self.mesh.fixed
+        self._free[nodes] = False
+        held = np.flatnonzero(~self._free & ~self.mesh.fixed)
+        if not np.array_equal(held, self._held):
+            self._held = held
+            self._answers()
+
+    def _answers(self) -> None:
+        """How the mesh answers to unit forces on the held nodes, by the kept factor."""
+        held = self._held
+        self._columns = np.zeros((3 * len(held), *self.x.shape))
+        unit = np.zeros_like(self.x)
+        for k in range(3 * len(held)):
+            unit[held[k // 3], k % 3] = 1.0
+            self._factoring.solve(unit, self._columns[k])
+            unit[held[k // 3], k % 3] = 0.0
+        answer = self._columns[:, held].reshape(3 * len(held), 3 * len(held))
+        self._inverse = np.asarray(np.linalg.inv(0.5 * (answer + answer.T)))
+
+    def _update(self) -> None:
+        """The stiffness at ``x``, and a new factor where the old one has become slow."""
+        m = self.mesh
         if self._slow:
             self._slow = False
             self.factors += 1
-            if not self._factoring.compute(block):
-                return False
-            self._held = self._held[:0]
-        held = np.flatnonzero(~free & ~self._mesh.fixed)
-        if not np.array_equal(held, self._held):
-            self._hold(held)
-        return True
+            for positive_part in (False, True):
+                link_blocks(self.x, m.links, m.rest_length, m.stiffness, positive_part, self._block)
+                if self._factoring.compute(self._block):
+                    break
+            self._answers()
+        link_blocks(self.x, m.links, m.rest_length, m.stiffness, False, self._block)
 
-    def _hold(self, held: np.ndarray) -> None:
-        n = len(self._mesh.rest)
-        self._held = held
-        self._columns = np.zeros((3 * len(held), n, 3))
-        for k, node in enumerate(held):
-            for c in range(3):
-                unit = np.zeros((n, 3))
-                unit[node, c] = 1.0
-                self._factoring.solve(unit, self._columns[3 * k + c])
-        answer = self._columns[:, held].reshape(3 * len(held), 3 * len(held))
-        self._inverse = np.linalg.inv(0.5 * (answer + answer.T))
+    def _predict(self, nodes: np.ndarray, places: Array, load: Array) -> float:
+        """Moves the nodes, and all others along the tangent to the path of equilibria if that has less energy."""
+        x, way, trial = self.x, self._way, self._trial
+        way[:] = 0.0
+        way[nodes] = places - x[nodes]
+        trial[:] = x
+        if np.any(way):
+            self._evaluate(x, load, self._force)
+            self._update()
+            multiply(self._block, self.mesh.links, way, self._trial_force)
+            self._trial_force[~self._free] = 0.0
+            np.subtract(self._force, self._trial_force, out=self._trial_force)
+            self._solve(self._trial_force, FIRST_ACCURACY, math.inf)
+            trial += self._step
+            trial[nodes] = places
+        x[nodes] = places
+        energy = self._evaluate(x, load, self._force)
+        predicted = self._evaluate(trial, load, self._trial_force)
+        if predicted < energy:
+            x[:] = trial
+            self._force, self._trial_force = self._trial_force, self._force
+            energy = predicted
+        return energy
 
-    def solve(self, force: Array, accuracy: float, out: Array) -> bool:
-        f = self._factoring
-        positive, iterations = _iterate(
-            self._block, self._mesh.links, self._free, f.factor, self._held, self._columns, self._inverse,
-            force, accuracy, MOST, out, self._scratch, f._v, f._w,
-        )
+    def _solve(self, force: Array, accuracy: float, radius: float) -> tuple[float, float, bool]:
+        """The step from ``x`` into ``_step``: the decrease that it promises, its length, and if the border cut it."""
+        decrease, length, cut, iterations = conjugate_gradients(
+            self._block, self.mesh.links, self._free, self._factoring.factor, self._held, self._columns, self._inverse,
+            force, accuracy, radius, self._longest, self._step, self._scratch,
+        )  # fmt: skip
         self.iterations += iterations
         self._slow = iterations > SLOW
-        return positive
+        return decrease, length, cut
+
+    def _evaluate(self, x: Array, load: Array, force: Array) -> float:
+        """The energy at ``x`` (n, 3); ``force`` (n, 3) becomes what is unbalanced on the free nodes."""
+        m = self.mesh
+        force[:] = load
+        energy = add_forces(x, m.links, m.rest_length, m.stiffness, 0, len(m.links), force)
+        force[~self._free] = 0.0
+        return float(energy - np.vdot(load, x))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -91,48 +211,100 @@ def _dot(a: Array, b: Array) -> float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _iterate(block, links, free, factor, held, columns, inverse, force, accuracy, most, out, scratch, v, w):
-    r, z, p, q = scratch[0], scratch[1], scratch[2], scratch[3]
+def _add(a: float, source: Array, target: Array) -> None:
+    u, v = source.reshape(-1), target.reshape(-1)
+    for i in range(len(u)):
+        v[i] += a * u[i]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _zero(free: np.ndarray, values: Array) -> None:
+    for i in range(len(free)):
+        if not free[i]:
+            values[i, 0] = values[i, 1] = values[i, 2] = 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def precondition(
+    free: np.ndarray,
+    factor: MultifrontalFactor,
+    held: np.ndarray,
+    columns: Array,
+    inverse: Array,
+    s: Scratch,
+) -> None:
+    """``s.z`` = M⁻¹ ``s.r`` with the held nodes at rest; overwrites ``s.q``."""
+    multifrontal.solve(factor, s.r, s.v, s.w, s.z)
+    share = s.q.reshape(-1)
+    for i in range(len(inverse)):
+        share[i] = 0.0
+        for j in range(len(inverse)):
+            share[i] += inverse[i, j] * s.z[held[j // 3], j % 3]
+    for i in range(len(inverse)):
+        _add(-share[i], columns[i], s.z)
+    _zero(free, s.z)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def conjugate_gradients(
+    block: Array,
+    links: np.ndarray,
+    free: np.ndarray,
+    factor: MultifrontalFactor,
+    held: np.ndarray,
+    columns: Array,
+    inverse: Array,
+    force: Array,
+    accuracy: float,
+    radius: float,
+    longest: float,
+    out: Array,
+    s: Scratch,
+) -> tuple[float, float, bool, int]:
+    """The step ``out`` (n, 3) mm that lowers the quadratic model under ``force`` (n, 3) mN, within ``radius``.
+
+    Without a radius (inf) a direction in which the energy curves down is followed until a node has gone ``longest`` mm.
+    Returns (the model's decrease, the step's length in the norm of M, cut short, iterations).
+    """
     out[:] = 0.0
-    r[:] = force
-    p[:] = 0.0
-    goal = accuracy * accuracy * _dot(r, r)
+    s.r[:] = force
+    s.p[:] = 0.0
+    goal = accuracy * accuracy * _dot(s.r, s.r)
     rho = 1.0
-    for iteration in range(most):
-        multifrontal.solve(factor, r, v, w, z)
-        for i in range(len(inverse)):
-            share = 0.0
-            for j in range(len(inverse)):
-                share += inverse[i, j] * z[held[j // 3], j % 3]
-            q[i // 3, i % 3] = share
-        for i in range(len(inverse)):
-            share = q[i // 3, i % 3]
-            u, t = columns[i].reshape(-1), z.reshape(-1)
-            for k in range(len(u)):
-                t[k] -= share * u[k]
-        for i in range(len(free)):
-            if not free[i]:
-                z[i, 0] = z[i, 1] = z[i, 2] = 0.0
-        new = _dot(r, z)
+    decrease = 0.0
+    oo = op = pp = 0.0  # products of out and p with M, by recurrence
+    for iteration in range(MOST):
+        precondition(free, factor, held, columns, inverse, s)
+        new = _dot(s.r, s.z)
         if not new > 0.0:
-            return iteration > 0, iteration
+            return decrease, math.sqrt(oo), False, iteration
         beta = new / rho if iteration else 0.0
+        u, t = s.p.reshape(-1), s.z.reshape(-1)
+        for i in range(len(u)):
+            u[i] = t[i] + beta * u[i]
+        op = beta * op
+        pp = new + beta * beta * pp
         rho = new
-        for i in range(len(p)):
-            for c in range(3):
-                p[i, c] = z[i, c] + beta * p[i, c]
-        multiply(block, links, p, q)
-        for i in range(len(free)):
-            if not free[i]:
-                q[i, 0] = q[i, 1] = q[i, 2] = 0.0
-        curvature = _dot(p, q)
-        if not curvature > 0.0:
-            return False, iteration
-        alpha = rho / curvature
-        for i in range(len(p)):
-            for c in range(3):
-                out[i, c] += alpha * p[i, c]
-                r[i, c] -= alpha * q[i, c]
-        if _dot(r, r) <= goal:
-            return True, iteration + 1
-    return True, most
+        multiply(block, links, s.p, s.q)
+        _zero(free, s.q)
+        curvature = _dot(s.p, s.q)
+        alpha = rho / curvature if curvature > 0.0 else math.inf
+        if not oo + alpha * (2.0 * op + alpha * pp) < radius * radius or curvature <= 0.0:
+            if radius < math.inf:
+                alpha = (math.sqrt(max(op * op + pp * (radius * radius - oo), 0.0)) - op) / pp
+            else:
+                largest = 0.0
+                for i in range(len(u)):
+                    largest = max(largest, abs(u[i]))
+                alpha = longest / largest
+            decrease += alpha * rho - 0.5 * alpha * alpha * curvature
+            _add(alpha, s.p, out)
+            return decrease, math.sqrt(oo + alpha * (2.0 * op + alpha * pp)), True, iteration + 1
+        decrease += 0.5 * alpha * rho
+        oo += alpha * (2.0 * op + alpha * pp)
+        op += alpha * pp
+        _add(alpha, s.p, out)
+        _add(-alpha, s.q, s.r)
+        if _dot(s.r, s.r) <= goal:
+            return decrease, math.sqrt(oo), False, iteration + 1
+    return decrease, math.sqrt(oo), False, MOST

@@ -303,8 +303,7 @@ class Multifrontal:
         self._stack = np.zeros(_stack_size(fronts))
         self._diagonal = np.zeros(f)
         self._local = np.zeros(len(fronts.order), dtype=np.int64)
-        self._v = np.zeros(f, dtype=np.float32)
-        self._w = np.zeros(longest, dtype=np.float32)
+        self.scratch = (np.zeros(f, dtype=np.float32), np.zeros(longest, dtype=np.float32))  # v, w of solve
 
     def compute(self, blocks: Array) -> bool:
         """The factor of the link blocks (m, 3, 3); False when their sum is not positive definite."""
@@ -318,4 +317,4 @@ class Multifrontal:
 
     def solve(self, values: Array, out: Array) -> None:
         """K⁻¹ ``values`` (n, 3) into the rows of ``out`` (n, 3) that are unknowns."""
-        solve(self.factor, values, self._v, self._w, out)
+        solve(self.factor, values, *self.scratch, out)

@@ -1,11 +1,10 @@
-"""Nested dissection of a link mesh: an order of elimination whose factor stays sparse (George 1973, SIAM J. Numer. Anal.
-10:345).
+"""Nested dissection of a link mesh: an order of elimination whose factor stays sparse.
 
-The nodes are parted by a plane, and those on one side that have a link to the other are eliminated last: no fill then
-joins the two parts. Each part is treated alike until it is small. Of the three planes across the principal axes of the
-mesh that one is taken which leaves the smallest separator. Every separator, and every part at the end, is a *front*:
-its nodes (pivots) are eliminated together from a dense matrix of themselves and of the later nodes that they touch
-(rows).
+George 1973, SIAM J. Numer. Anal. 10:345. The nodes are parted by a plane, and those on one side that have a link to the
+other are eliminated last: no fill then joins the two parts. Each part is treated alike until it is small. Of the three
+planes across the principal axes of the mesh that one is taken which leaves the smallest separator. Every separator, and
+every part at the end, is a *front*: its nodes (pivots) are eliminated together from a dense matrix of themselves and of
+the later nodes that they touch (rows).
 """
 
 from __future__ import annotations

@@ -6,19 +6,17 @@ along with them. A step along which H is not positive is taken with the blocks' 
 leads down. Each further step is shortened until the energy falls (Armijo; Nocedal and Wright, Numerical Optimization,
 algorithms 3.1 and 7.1), so that the energy never rises but by rounding.
 
-The linear system is solved by ``SuperLU``, which factors again at each step and is the reference, or by
-``krylov.KeptFactorCG``, which does not.
+Each system is factored anew by scipy's SuperLU: the reference for the others. ``krylov`` is for big meshes.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numba import njit
 from scipy.sparse import csc_matrix
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu
 
 from trainer.geometry import Array
 from trainer.mechanics.links import LinkMesh, add_forces, link_blocks
@@ -29,8 +27,6 @@ DECREASE, SHORTEST_STEP = 1e-4, 1e-6
 ROUNDING = 1e-14
 #: No node goes further in one step, in median links.
 LONGEST = 4.0
-#: The least accuracy of a linear solve, as a share of its right-hand side.
-FIRST_ACCURACY = 0.1
 
 
 @dataclass(frozen=True)
@@ -43,37 +39,14 @@ class Outcome:
     energy: float  # mN mm
 
 
-class LinearSolver(Protocol):
-    """Solves with a mesh's stiffness, given by the block of each link, for the nodes that are free."""
+def factor(matrix: csc_matrix) -> tuple[SuperLU, bool]:
+    """The factors of a symmetric matrix by scipy's SuperLU, and whether they show it to be positive definite.
 
-    def prepare(self, block: Array, free: np.ndarray) -> bool:
-        """Takes up the blocks (m, 3, 3) mN/mm and which nodes are free (n,) bool; both are still the caller's, who
-        changes them before the next call only. False when the matrix shows itself not to be positive definite."""
-
-    def solve(self, force: Array, accuracy: float, out: Array) -> bool:
-        """The step ``out`` (n, 3) mm, zero where not free, whose residual is at most ``accuracy`` of ``force`` (n, 3) mN,
-        which is zero where not free. False when the matrix shows itself not to be positive definite."""
-
-
-class SuperLU:
-    """The sparse LU factors of scipy (SuperLU), made anew for each matrix."""
-
-    def __init__(self, mesh: LinkMesh) -> None:
-        self._mesh = mesh
-
-    def prepare(self, block: Array, free: np.ndarray) -> bool:
-        self._free = np.flatnonzero(free)
-        dof = (3 * self._free[:, None] + np.arange(3)).ravel()
-        matrix = sparse_matrix(self._mesh, block)[dof][:, dof]
-        # A symmetric order, and pivots from the diagonal: then the signs on U's diagonal are those of the eigenvalues
-        # (Sylvester's law of inertia).
-        self._lu = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-        return bool(np.array_equal(self._lu.perm_r, self._lu.perm_c) and np.all(self._lu.U.diagonal() > 0.0))
-
-    def solve(self, force: Array, accuracy: float, out: Array) -> bool:
-        out[:] = 0.0
-        out[self._free] = self._lu.solve(force[self._free].ravel()).reshape(-1, 3)
-        return True
+    A symmetric order, and pivots from the diagonal: then the signs on U's diagonal are those of the eigenvalues
+    (Sylvester's law of inertia).
+    """
+    lu = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    return lu, bool(np.array_equal(lu.perm_r, lu.perm_c) and np.all(lu.U.diagonal() > 0.0))
 
 
 def sparse_matrix(mesh: LinkMesh, block: Array) -> csc_matrix:
@@ -103,12 +76,11 @@ def multiply(block: Array, links: np.ndarray, v: Array, out: Array) -> None:
 class Newton:
     """The state ``x`` (n, 3) mm of a mesh, some of whose nodes are moved; the others follow to equilibrium."""
 
-    def __init__(self, mesh: LinkMesh, solver: LinearSolver) -> None:
+    def __init__(self, mesh: LinkMesh) -> None:
         """Raises ValueError for a node that is neither fixed nor linked."""
         refuse_loose_nodes(mesh)
         self.mesh = mesh
         self.x = mesh.rest.copy()
-        self._solver = solver
         self._longest = float(np.median(mesh.rest_length))
         self._block = np.zeros((len(mesh.links), 3, 3))
         self._trial, self._step, self._way = (mesh.rest.copy() for _ in range(3))
@@ -133,14 +105,11 @@ class Newton:
         free = ~self.mesh.fixed
         free[nodes] = False
         energy = self._predict(nodes, places, free, load)
-        first = max(float(np.linalg.norm(self._force)), 1e-300)
         for step in range(most_steps):
             residual = float(np.linalg.norm(self._force))
             if residual <= tolerance_mN:
                 return Outcome(True, step, residual, energy)
-            # Steps are solved for as exactly as pays: an inexact Newton method (Nocedal and Wright, section 7.1).
-            accuracy = max(min(FIRST_ACCURACY, residual / first), 0.1 * tolerance_mN / residual)
-            self._direction(free, accuracy)
+            self._direction(free)
             lower = self._search(free, load, energy)
             if lower is None:
                 return Outcome(False, step, residual, energy)
@@ -160,9 +129,7 @@ class Newton:
             multiply(self._block, self.mesh.links, way, self._trial_force)
             self._trial_force[~free] = 0.0
             np.subtract(self._force, self._trial_force, out=self._trial_force)
-            if self._solver.prepare(self._block, free) and self._solver.solve(
-                self._trial_force, FIRST_ACCURACY, self._step
-            ):
+            if self._solve(self._trial_force, free):
                 trial += self._step
             trial[nodes] = places
         x[nodes] = places
@@ -174,18 +141,24 @@ class Newton:
             energy = predicted
         return energy
 
-    def _direction(self, free: np.ndarray, accuracy: float) -> None:
+    def _direction(self, free: np.ndarray) -> None:
         """Newton's step from ``x`` into ``_step``; it leads down."""
         m = self.mesh
         for project in (False, True):
             link_blocks(self.x, m.links, m.rest_length, m.stiffness, project, self._block)
-            if (
-                self._solver.prepare(self._block, free)
-                and self._solver.solve(self._force, accuracy, self._step)
-                and float(np.vdot(self._force, self._step)) > 0.0
-            ):
+            if self._solve(self._force, free) and float(np.vdot(self._force, self._step)) > 0.0:
                 return
         self._step[:] = self._force / float(np.max(np.abs(self._block)))  # steepest descent
+
+    def _solve(self, force: Array, free: np.ndarray) -> bool:
+        """The step that ``_block`` answers to ``force`` with, into ``_step``; False if it is not positive definite."""
+        at = np.flatnonzero(free)
+        dof = (3 * at[:, None] + np.arange(3)).ravel()
+        lu, positive = factor(sparse_matrix(self.mesh, self._block)[dof][:, dof])
+        self._step[:] = 0.0
+        if positive:
+            self._step[at] = lu.solve(force[at].ravel()).reshape(-1, 3)
+        return positive
 
     def _search(self, free: np.ndarray, load: Array, energy: float) -> float | None:
         """Goes along ``_step`` as far as the energy falls enough; the new energy, or None if it nowhere does."""
