@@ -290,6 +290,7 @@ def settle(state: RodState, held: Holds, contacts: Contacts | None = None) -> Se
         iterations += abs(spent)
         if spent < 0:
             share *= 0.25
+            firmness *= 8.0
             touching.push[:] = 0.0
             touching.grip[:] = 0.0
             if share < LEAST_SHARE:

@@ -125,54 +125,74 @@ def _touch(x: Array, begin: Array, contacts: Contacts, moved: float, part: float
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _add_contacts(x: Array, contacts: Contacts, moved: float, part: float, work: Work, first: bool) -> None:
-    """Forces of the contacts into ``work.left`` and their stiffness into the matrix."""
-    a, left = work.a, work.left
+def _residual(law: Law, work: Work, frame: Array, contacts: Contacts, moved: float, part: float) -> None:
+    """All forces that are left at the nodes, into ``work.left``."""
+    x, left = work.x, work.left
+    directions(x, work.t, work.size)
+    if law.curved:
+        rest_bends(x, frame, law.curvature, law.link, work.t, work.rest)
+    imbalance(x, work.tension, work.y, work.weight, work.force, law.bend, work.rest, work.t, left)
+    for i in range(len(x)):
+        if work.pull[i] > 0.0:
+            dx, dy, dz = work.aim[i, 0] - x[i, 0], work.aim[i, 1] - x[i, 1], work.aim[i, 2] - x[i, 2]
+            k = work.pull[i] / max(math.sqrt(dx * dx + dy * dy + dz * dz), NEAR * law.link)
+            left[i, 0] += k * dx
+            left[i, 1] += k * dy
+            left[i, 2] += k * dz
     for k in range(contacts.used[0]):
-        i, j = contacts.link[k], contacts.other[k]
-        if first:
-            stiff = max(a[4 * i, 0], a[4 * i + 4, 0])
-            contacts.stiff[k] = STIFF * stiff
-        push, fx, fy, fz, sticks = _touch(x, work.begin, contacts, moved, part, k)
+        i, j, s, r = contacts.link[k], contacts.other[k], contacts.place[k, 0], contacts.place[k, 1]
+        push, fx, fy, fz, _ = _touch(x, work.begin, contacts, moved, part, k)
         force = (
             push * contacts.normal[k, 0] + fx,
             push * contacts.normal[k, 1] + fy,
             push * contacts.normal[k, 2] + fz,
         )
-        # The other link answers to the same force in its own rows: twice the stiffness keeps the two from overshooting.
-        stiff = contacts.stiff[k] * (1.0 if j < 0 else 2.0) if push > 0.0 else 0.0
-        for side in range(1 if j < 0 else 2):
-            node = i if side == 0 else j
-            s = contacts.place[k, side]
-            sign = 1.0 if side == 0 else -1.0
-            for c in range(3):
-                left[node, c] += sign * (1.0 - s) * force[c]
-                left[node + 1, c] += sign * s * force[c]
-                for e in range(c, 3):
-                    nn = contacts.normal[k, c] * contacts.normal[k, e]
-                    value = stiff * (nn * (1.0 - sticks) + (sticks if c == e else 0.0))
-                    a[4 * node + c, e - c] += (1.0 - s) * (1.0 - s) * value
-                    a[4 * node + 4 + c, e - c] += s * s * value
-                    a[4 * node + c, 4 + e - c] += s * (1.0 - s) * value
-                    if e > c:
-                        a[4 * node + e, 4 + c - e] += s * (1.0 - s) * value
+        for c in range(3):
+            left[i, c] += (1.0 - s) * force[c]
+            left[i + 1, c] += s * force[c]
+            if j >= 0:
+                left[j, c] -= (1.0 - r) * force[c]
+                left[j + 1, c] -= r * force[c]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _add_pulls(x: Array, work: Work, link: float) -> None:
-    """Forces of slipping holds towards their places: whole from ``NEAR`` links off, a spring nearer than that."""
-    for i in range(len(x)):
+def _add_pulls(work: Work, link: float) -> None:
+    """How the forces of slipping holds turn with their nodes, or give, into the matrix."""
+    for i in range(len(work.x)):
         if work.pull[i] > 0.0:
-            r = (work.aim[i, 0] - x[i, 0], work.aim[i, 1] - x[i, 1], work.aim[i, 2] - x[i, 2])
+            r = (work.aim[i, 0] - work.x[i, 0], work.aim[i, 1] - work.x[i, 1], work.aim[i, 2] - work.x[i, 2])
             size2 = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
             away = math.sqrt(size2) > NEAR * link
             k = work.pull[i] / (math.sqrt(size2) if away else NEAR * link)
             for c in range(3):
-                work.left[i, c] += k * r[c]
                 for e in range(c, 3):
                     work.a[4 * i + c, e - c] += k * (1.0 if c == e else 0.0)
                     if away:
                         work.a[4 * i + c, e - c] -= k * r[c] * r[e] / size2
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add_contacts(work: Work, contacts: Contacts, moved: float, part: float) -> None:
+    """Stiffness of the contacts into the matrix."""
+    a = work.a
+    for k in range(contacts.used[0]):
+        i, j = contacts.link[k], contacts.other[k]
+        push, _, _, _, sticks = _touch(work.x, work.begin, contacts, moved, part, k)
+        if push > 0.0:
+            # The other link answers to the same force in its own rows: twice the stiffness, and neither overshoots.
+            stiff = contacts.stiff[k] * (1.0 if j < 0 else 2.0)
+            for side in range(1 if j < 0 else 2):
+                node = i if side == 0 else j
+                s = contacts.place[k, side]
+                for c in range(3):
+                    for e in range(c, 3):
+                        nn = contacts.normal[k, c] * contacts.normal[k, e]
+                        value = stiff * (nn * (1.0 - sticks) + (sticks if c == e else 0.0))
+                        a[4 * node + c, e - c] += (1.0 - s) * (1.0 - s) * value
+                        a[4 * node + 4 + c, e - c] += s * s * value
+                        a[4 * node + c, 4 + e - c] += s * (1.0 - s) * value
+                        if e > c:
+                            a[4 * node + e, 4 + c - e] += s * (1.0 - s) * value
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -202,15 +222,15 @@ def solve(law: Law, work: Work, frame: Array, contacts: Contacts, moved: float, 
     n = len(x)
     touching = contacts.used[0] > 0
     for iteration in range(1, (MOST_CONTACT_ITERATIONS if touching else MOST_ITERATIONS) + 1):
-        directions(x, work.t, work.size)
-        if law.curved:
-            rest_bends(x, frame, law.curvature, law.link, work.t, work.rest)
+        _residual(law, work, frame, contacts, moved, part)
         for compression in range(2):
-            imbalance(x, tension, work.y, work.weight, work.force, law.bend, work.rest, work.t, work.left)
             assemble(tension, work.weight, law.bend, law.stretch, law.link, work.t, work.size, compression == 0, work.a)
-            if touching:
-                _add_contacts(x, contacts, moved, part, work, iteration == 1)
-            _add_pulls(x, work, law.link)
+            if iteration == 1 and compression == 0:
+                for k in range(contacts.used[0]):
+                    i = contacts.link[k]
+                    contacts.stiff[k] = STIFF * max(work.a[4 * i, 0], work.a[4 * i + 4, 0])
+            _add_contacts(work, contacts, moved, part)
+            _add_pulls(work, law.link)
             hold(work.held, work.a)
             if factor(work.a, 4 * n):
                 break
@@ -241,5 +261,6 @@ def solve(law: Law, work: Work, frame: Array, contacts: Contacts, moved: float, 
         if touching:
             furthest = max(furthest, _update_contacts(x, contacts, moved, part, work.begin))
         if furthest <= CLOSE * law.link:
+            _residual(law, work, frame, contacts, moved, part)
             return iteration
     return -1
