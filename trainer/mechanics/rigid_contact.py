@@ -23,7 +23,6 @@ import numpy as np
 from trainer.geometry import Array, Rigid
 from trainer.mechanics.pair_list import checked_elements, largest_magnitude
 
-
 #: The triangles of a box whose corners are numbered by the bits x, y, z.
 BOX = np.array(
     [
@@ -72,7 +71,7 @@ class RigidBody:
         """A box about the origin with these sides along x, y, z."""
         sides = [_length(side, "sides_mm") for side in sides_mm]
         body = cls(fcl.Box(*sides))
-        corners = (np.indices((2, 2, 2)).reshape(3, 8).T - 0.5) * sides
+        corners = np.array((np.indices((2, 2, 2)).reshape(3, 8).T - 0.5) * sides, dtype=np.float64, order="C")
         body.surface = fcl.CollisionObject(_surface(corners, BOX), fcl.Transform())
         return body
 
