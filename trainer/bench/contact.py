@@ -25,8 +25,8 @@ from trainer.mechanics.self_contact import SelfContact
 #: Layers and nodes around of the vessels: 1 984, 19 800 and 199 712 triangles.
 SURFACES = ((32, 32), (100, 100), (317, 316))
 SEGMENTS, OWN_SEGMENTS = 300, 1000
-#: A pair is near at this distance: two radii of 10-0 thread and as much again for a tick's motion (assumed).
-MARGIN_MM = 0.05
+#: A pair is near at this distance: the radius of 10-0 thread and as much again for the motion of a tick (assumed).
+MARGIN_MM = 0.03
 #: The vessel: outer radius and length.
 RADIUS_MM, LENGTH_MM = 1.0, 10.0
 #: States of the surface that the frames go through, and how often each method runs; those with FCL less often.
@@ -69,7 +69,7 @@ def vessel(layers: int, around: int) -> tuple[list[Array], np.ndarray]:
     inner = i < layers - 1
     a, right = (i * around + j)[inner], (i * around + (j + 1) % around)[inner]
     triangles = np.concatenate(
-        [np.stack([a, a + around, right + around], axis=1), np.stack([a, right + around, right], axis=1)]
+        [np.stack([a, right + around, a + around], axis=1), np.stack([a, right, right + around], axis=1)]
     )
     return states, triangles.astype(np.int32)
 

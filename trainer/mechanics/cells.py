@@ -19,8 +19,8 @@ from trainer.mechanics.closest_points import segment_near_triangle
 from trainer.mechanics.pair_list import PairList, checked_elements, checked_margin, largest_magnitude, rounding_mm
 from trainer.mechanics.segment_grid import SegmentGrid, any_in, cell_of
 
-#: Triangles in a block: smaller blocks share more nodes, larger ones lie nearer to more segments.
-BLOCK = 64
+#: Triangles in a block: of 8, 16, 32, 64 and 128 the fastest or nearly so at 2 000, 20 000 and 200 000 triangles.
+BLOCK = 32
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
