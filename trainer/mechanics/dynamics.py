@@ -191,8 +191,10 @@ def add_link_forces(model: Model, x: Array, v: Array, slip: Array, force: Array)
             length - model.rest_length[e], slip[e],
             law.stiffness[e], law.growth[e], law.toe[e], law.loss[e], law.friction[e],
         )  # fmt: skip
-        rate = ((v[j, 0] - v[i, 0]) * dx + (v[j, 1] - v[i, 1]) * dy + (v[j, 2] - v[i, 2]) * dz) / length
-        pull = (tension + model.dashpot[e] * rate) / length
+        pull = tension / length
+        if model.dashpot[e] > 0.0:
+            along = (v[j, 0] - v[i, 0]) * dx + (v[j, 1] - v[i, 1]) * dy + (v[j, 2] - v[i, 2]) * dz
+            pull += model.dashpot[e] * along / (length * length)
         force[i, 0] += pull * dx
         force[i, 1] += pull * dy
         force[i, 2] += pull * dz

@@ -252,8 +252,8 @@ def add_step(v: Array, t: float, step: Array) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def newton(model: Model, state: State, s: Solve, h: float, tolerance_mN: float, most_steps: int) -> tuple[bool, int]:
-    """Leaves the new velocities in ``s.v`` and positions in ``s.x``; whether they meet the tolerance, and the steps."""
+def newton(model: Model, state: State, s: Solve, h: float, tolerance_mN: float, most_steps: int) -> tuple[bool, float]:
+    """Leaves the new velocities in ``s.v`` and positions in ``s.x``; whether they will do, and the residual, mN."""
     held = state.held
     s.v[:] = 0.0
     force = residual(model, state, s.v, h, s.x, s.r)
@@ -280,10 +280,10 @@ def newton(model: Model, state: State, s: Solve, h: float, tolerance_mN: float, 
                 break
             t *= min(0.5, max(0.1, slope / (slope - new_slope)))
         if force <= tolerance_mN:
-            return True, steps
+            return True, force
         if not math.isfinite(force):
-            return False, steps
-    return most_steps == 1, most_steps
+            return False, force
+    return most_steps == 1, force
 
 
 class BackwardEuler:
@@ -304,6 +304,8 @@ class BackwardEuler:
         if newton_steps < 1:
             raise ValueError(f"'newton_steps' must be at least 1, found {newton_steps}")
         self.model, self.tolerance_mN, self.newton_steps = model, tolerance_mN, newton_steps
+        #: Norm of the forces that the last step left unbalanced, mN: the largest of its substeps.
+        self.residual_mN = 0.0
         n, m = len(model.mass), len(model.links)
         by_node, old = np.zeros((8, n, 3)), np.zeros((2, n, 3))
         self._solve = Solve._make([*by_node, np.zeros((m, 6)), np.zeros((n, 6)), *old, np.zeros(m)])
@@ -321,12 +323,14 @@ class BackwardEuler:
         # Time is counted in the smallest substeps, so that the halves add up.
         whole = 1 << MOST_HALVINGS
         done, size, substeps = 0, whole, 0
+        self.residual_mN = 0.0
         while done < whole:
             h = duration * (size / whole)
-            converged, _ = newton(self.model, state, s, h, self.tolerance_mN, self.newton_steps)
+            converged, left = newton(self.model, state, s, h, self.tolerance_mN, self.newton_steps)
             if converged and finite(s.x) and finite(s.v):
                 state.x[:], state.v[:] = s.x, s.v
                 settle_links(self.model, state)
+                self.residual_mN = max(self.residual_mN, left)
                 done, substeps = done + size, substeps + 1
             elif size > 1:
                 size //= 2
