@@ -19,9 +19,9 @@ from trainer.mechanics.attachments import Anchors, Loads
 #: so that a held point is off its place by a hundredth of the dent that the force makes.
 HOLD = 100.0
 #: Unbalanced force at which the tissue counts as in equilibrium, mN: a thousandth of a puncture force.
-TOLERANCE_MN = 2e-3
+TOLERANCE_MN = 1e-2
 #: Iterations of one solve; the next movement goes on where it stopped (one solve in a hundred leaves 0.02 mN).
-MOST_ITERATIONS = 12
+MOST_ITERATIONS = 8
 
 
 def grips(world: World) -> Grips:
