@@ -16,7 +16,7 @@ from trainer.mechanics.integrators import RK4, Explicit
 
 @pytest.fixture(scope="module")
 def work() -> integrators.Work:
-    return integrators.prepare(4, 8, "soft", frames=2, parts=(1, 2))
+    return integrators.prepare(4, 8, "soft", frames=1, parts=(1, 2))
 
 
 @pytest.fixture(scope="module")
@@ -58,12 +58,10 @@ def test_the_vessel_is_let_go_from_balance(work: integrators.Work) -> None:
     state = work.begin()
     free.step(state, 1e-9)
     gained = np.linalg.norm(state.v, axis=1) * work.model.mass / 1e-9
-    cut = np.isclose(np.linalg.norm(work.answers[0] - work.plucked, axis=1), 0.0, atol=0.0)
     drawn = np.zeros(len(gained), dtype=bool)
     drawn[:16] = True  # the first layer
     assert np.linalg.norm(gained[~drawn]) < 2.0 * work.tolerance_mN
     assert np.linalg.norm(gained[drawn]) > 100.0 * work.tolerance_mN
-    assert cut.sum() == 16  # only the clamp's nodes stay
 
 
 def test_who_would_take_too_long_is_left_out() -> None:

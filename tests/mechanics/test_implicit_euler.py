@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from test_integrators import FREQUENCY, MASS, STIFFNESS, WEIGHTLESS, block, in_motion, spring, stretched
+from swinging import FREQUENCY, MASS, STIFFNESS, WEIGHTLESS, block, in_motion, spring, stretched
 
 from trainer.mechanics.dynamics import at_rest, mechanical_energy, model
 from trainer.mechanics.implicit_euler import BackwardEuler, linearise, multiply, residual

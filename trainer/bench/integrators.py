@@ -37,7 +37,7 @@ DENSITY, DAMPING = 1.06e-6, 200.0
 VISCOSITY = 2e-5
 #: How far the cut edge is drawn aside, in radii of the vessel; by how many steps of so many seconds.
 PLUCKED, DRAWING_STEPS, DRAWING_STEP_S = 0.3, 10, 1.0
-FRAME_S, FRAMES, QUICK_FRAMES = 0.01, 3, 2
+FRAME_S, FRAMES = 0.01, 2
 #: Steps of the explicit methods, in parts of the stable one, and of backward Euler, in parts of a frame.
 PARTS = (1, 2)
 QUICK_PARTS = (1,)
@@ -186,11 +186,11 @@ def compare(work: Work, quick: bool) -> list[Row]:
 
 
 def measure(quick: bool) -> list[Row]:
-    """All rows; ``quick`` takes the small vessels only, fewer frames and steps. Kernels are compiled before."""
+    """All rows; ``quick`` takes the small vessels only, and fewer steps. Kernels are compiled before."""
     compare(prepare(4, 8, "soft", 1, QUICK_PARTS), quick=True)
-    frames, parts = (QUICK_FRAMES, QUICK_PARTS) if quick else (FRAMES, PARTS)
+    parts = QUICK_PARTS if quick else PARTS
     rows: list[Row] = []
     for layers, around in MESHES[:1] if quick else MESHES:
         for stiffness in MODULI_kPa:
-            rows += compare(prepare(layers, around, stiffness, frames, parts), quick)
+            rows += compare(prepare(layers, around, stiffness, FRAMES, parts), quick)
     return rows
