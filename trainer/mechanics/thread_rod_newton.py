@@ -6,8 +6,9 @@ formulation for frictional contact problems prone to Newton like solution method
 
     N = max(0, N - k gap),    F = (F - k slip), cut to |F| <= mu N,
 
-so that a gap or a slip is left where the forces allow it and none where they do not. Two links that touch see one
-another's last place: their coupling is far from the band.
+so that a gap or a slip is left where the forces allow it and none where they do not. The bound of the friction is
+renewed with the multipliers: between two renewals friction has a potential, and the matrix is symmetric. Two links
+that touch see one another's last place: their coupling is far from the band.
 """
 
 from __future__ import annotations
@@ -33,8 +34,12 @@ from trainer.mechanics.thread_rod_solve import (
 
 MOST_TURN = 1.0  # link lengths that an iteration may move a node against its neighbour
 MOST_ITERATIONS = 30
-MOST_CONTACT_ITERATIONS = 150
+MOST_CONTACT_ITERATIONS = 100
 CLOSE = 1e-5  # link lengths: an iteration that moves no node further is the last; what it leaves is of second order
+SETTLED = 0.2  # of the change that is due: the multipliers are renewed after iterations that move no node further
+FAIR = 1e-3  # of the largest push: to this the multipliers agree with the nodes in the end
+NEARLY = 1e-3  # link lengths
+PATIENCE = 60  # iterations after which gaps and slips may be off by NEARLY, forces by 10 FAIR; lengths never are
 STIFF = 20.0  # a contact's k over the stiffness of the nodes it acts on; decides iterations, not the answer
 
 NEAR = 1e-3  # links: a slipping hold this close to its place has caught it
@@ -117,7 +122,7 @@ def _touch(x: Array, begin: Array, contacts: Contacts, moved: float, part: float
     fy = contacts.grip[k, 1] - contacts.stiff[k] * uy
     fz = contacts.grip[k, 2] - contacts.stiff[k] * uz
     size = math.sqrt(fx * fx + fy * fy + fz * fz)
-    most = contacts.friction[k] * push
+    most = contacts.friction[k] * contacts.push[k]
     sticks = 1.0
     if size > most:
         sticks = most / size
@@ -196,19 +201,26 @@ def _add_contacts(work: Work, contacts: Contacts, moved: float, part: float) -> 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _update_contacts(x: Array, contacts: Contacts, moved: float, part: float, begin: Array) -> float:
-    """New multipliers; returns the largest change of one, as the way in mm that its k makes of it."""
-    worst = 0.0
+def _change_contacts(
+    x: Array, contacts: Contacts, moved: float, part: float, begin: Array, take: bool
+) -> tuple[float, float]:
+    """The largest change of a multiplier that is due: the way in mm that its k makes of it, and its part of the largest
+    push. ``take``: make it.
+    """
+    worst, strongest, largest = 0.0, 0.0, 0.0
     for k in range(contacts.used[0]):
         push, fx, fy, fz, _ = _touch(x, begin, contacts, moved, part, k)
         change = abs(push - contacts.push[k])
         change = max(change, abs(fx - contacts.grip[k, 0]))
         change = max(change, abs(fy - contacts.grip[k, 1]))
         change = max(change, abs(fz - contacts.grip[k, 2]))
-        contacts.push[k] = push
-        contacts.grip[k, 0], contacts.grip[k, 1], contacts.grip[k, 2] = fx, fy, fz
         worst = max(worst, change / contacts.stiff[k])
-    return worst
+        strongest = max(strongest, change)
+        largest = max(largest, push)
+        if take:
+            contacts.push[k] = push
+            contacts.grip[k, 0], contacts.grip[k, 1], contacts.grip[k, 2] = fx, fy, fz
+    return worst, strongest / largest if largest > 0.0 else 0.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -223,12 +235,12 @@ def solve(law: Law, work: Work, frame: Array, contacts: Contacts, moved: float, 
     touching = contacts.used[0] > 0
     for iteration in range(1, (MOST_CONTACT_ITERATIONS if touching else MOST_ITERATIONS) + 1):
         _residual(law, work, frame, contacts, moved, part)
+        for k in range(contacts.used[0]):  # as stiff as the tensions have made the nodes by now
+            i = contacts.link[k]
+            stiff = work.weight[i] + 6.0 * law.bend + 2.0 * max(abs(tension[i]), abs(tension[i + 1])) / law.link
+            contacts.stiff[k] = STIFF * stiff if iteration == 1 else max(contacts.stiff[k], STIFF * stiff)
         for compression in range(2):
             assemble(tension, work.weight, law.bend, law.stretch, law.link, work.t, work.size, compression == 0, work.a)
-            if iteration == 1 and compression == 0:
-                for k in range(contacts.used[0]):
-                    i = contacts.link[k]
-                    contacts.stiff[k] = STIFF * max(work.a[4 * i, 0], work.a[4 * i + 4, 0])
             _add_contacts(work, contacts, moved, part)
             _add_pulls(work, law.link)
             hold(work.held, work.a)
@@ -258,9 +270,17 @@ def solve(law: Law, work: Work, frame: Array, contacts: Contacts, moved: float, 
             for c in range(3):
                 x[i, c] += step * work.b[4 * i + c]
             tension[i] += step * work.b[4 * i + 3]
+        enough = furthest <= CLOSE * law.link
         if touching:
-            furthest = max(furthest, _update_contacts(x, contacts, moved, part, work.begin))
-        if furthest <= CLOSE * law.link:
+            # The multipliers wait until the nodes have answered to the last ones: k makes much of a small gap.
+            way, share = _change_contacts(x, contacts, moved, part, work.begin, False)
+            if iteration <= PATIENCE:
+                enough = enough and way <= CLOSE * law.link and share <= FAIR
+            else:
+                enough = furthest <= 10.0 * CLOSE * law.link and way <= NEARLY * law.link and share <= 10.0 * FAIR
+            if enough or furthest <= SETTLED * way:
+                _change_contacts(x, contacts, moved, part, work.begin, True)
+        if enough:
             _residual(law, work, frame, contacts, moved, part)
             return iteration
     return -1
