@@ -87,7 +87,7 @@ def perform(
     from trainer.drivers import open_driver
     from trainer.metrics.registry import check_targets, score
     from trainer.scene import build
-    from trainer.session import interruptible, run
+    from trainer.session import interruptible, old_objects_left_alone, run
     from trainer.sinks.log import LogSink
     from trainer.sinks.recording import RecordingSink
     from trainer.sinks.surface import Sink
@@ -110,7 +110,7 @@ def perform(
         recording = RecordingSink(recording_path, header, scene.layout(), task.tick_hz, realtime=clock.realtime)
         sinks.append(stack.enter_context(closing(recording)))
     log = stack.enter_context(closing(LogSink(log_path, header)))
-    with closing(Progress(task)) as progress, interruptible() as interrupted:
+    with closing(Progress(task)) as progress, interruptible() as interrupted, old_objects_left_alone():
         run(scene, driver, [log, *sinks, progress], clock, lambda: interrupted() or enough())
     duration_s = scene.tick / task.tick_hz
     stored = log.record(scene.outcome, scene.tick, duration_s)
