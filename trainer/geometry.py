@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -141,8 +142,9 @@ class Rigid:
     def identity() -> Rigid:
         return Rigid(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 
+    @cached_property
     def matrix(self) -> Array:
-        """The rotation as a (3, 3) matrix, by scalars: this runs dozens of times in a tick."""
+        """The rotation as a (3, 3) matrix, by scalars: dozens are asked for in a tick."""
         w, x, y, z = self.quaternion.tolist()
         return np.array(
             [
@@ -154,15 +156,15 @@ class Rigid:
 
     def apply(self, points_b: ArrayLike) -> Array:
         """Points ``(..., 3)`` of frame b in frame a."""
-        return np.asarray(points_b, dtype=np.float64) @ self.matrix().T + self.position
+        return np.asarray(points_b, dtype=np.float64) @ self.matrix.T + self.position
 
     def rotate(self, directions_b: ArrayLike) -> Array:
         """Directions ``(..., 3)`` of frame b in frame a."""
-        return np.asarray(np.asarray(directions_b, dtype=np.float64) @ self.matrix().T)
+        return np.asarray(np.asarray(directions_b, dtype=np.float64) @ self.matrix.T)
 
     def inverse(self) -> Rigid:
         """b_from_a."""
-        return Rigid(-(self.position @ self.matrix()), quaternion_conjugate(self.quaternion))
+        return Rigid(-(self.position @ self.matrix), quaternion_conjugate(self.quaternion))
 
     def __matmul__(self, b_from_c: Rigid) -> Rigid:
         """a_from_c = a_from_b @ b_from_c."""

@@ -69,7 +69,7 @@ def needle_pose(point: Array, tangent: Array, inward: Array, arc: float, radius:
 
 def along_arc(pose: Rigid, distance: float, radius: float) -> Rigid:
     """The needle moved by ``distance`` mm along its own circle, tip first."""
-    matrix = pose.matrix()
+    matrix = pose.matrix
     centre = pose.position + radius * matrix[:, 1]
     phi = distance / radius
     s, c = math.sin(phi), math.cos(phi)

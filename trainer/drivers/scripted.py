@@ -186,7 +186,7 @@ class ScriptedHands:
         offset = self._see.needle_from_tool(tool)
         point, s0 = hole.point.copy(), hole.arc_mm
         normal = self._see.outward(vessel, rest)
-        needle = self._see.needle().matrix()
+        needle = self._see.needle().matrix
         phi = s0 / self._radius
         tangent = math.cos(phi) * needle[:, 0] - math.sin(phi) * needle[:, 1]
         steep0 = math.asin(min(1.0, max(-1.0, float(-tangent @ normal))))
@@ -279,14 +279,14 @@ class ScriptedHands:
         yield from self._catch(taking, place, lambda: taking in self._see.view.needle_holders)
         yield from self._jaws(giving, 0.0)
         here = self._pose[giving]
-        yield from self._glide(giving, Rigid(here.position - 2.0 * here.matrix()[:, 0], here.quaternion))
+        yield from self._glide(giving, Rigid(here.position - 2.0 * here.matrix[:, 0], here.quaternion))
 
     def _catch(self, tool: int, place: Callable[[], Rigid], caught: Callable[[], bool]) -> Movement:
         """Open, reach for ``place`` and close; look, and try again."""
         for _ in range(TRIES):
             yield from self._jaws(tool, 0.0)
             seen = place()
-            yield from self._glide(tool, Rigid(seen.position - STAND_OFF_MM * seen.matrix()[:, 0], seen.quaternion))
+            yield from self._glide(tool, Rigid(seen.position - STAND_OFF_MM * seen.matrix[:, 0], seen.quaternion))
             yield from self._glide(tool, place(), 0.5)
             yield from self._jaws(tool, 1.0)
             if caught():
@@ -297,7 +297,7 @@ class ScriptedHands:
         """Where an instrument holds the needle at ``arc``: jaws pointing at the circle's centre, across the wire."""
         phi = arc / self._radius
         s, c = math.sin(phi), math.cos(phi)
-        matrix = needle.matrix()
+        matrix = needle.matrix
         point = needle.apply(np.array([-self._radius * s, self._radius * (1.0 - c), 0.0]))
         inward = s * matrix[:, 0] + c * matrix[:, 1]
         return Rigid(point, quaternion_from_axes(inward, matrix[:, 2]))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -129,7 +129,7 @@ def settle(world: World, time_s: float) -> None:
                 Withdraw, time_s, "", body=world.vessel_name(hole.place), wall=hole.place.wall, hole=hole.number,
                 pass_number=hole.pass_number, end="tail", reached_mm=hole.reached_mm,
             )  # fmt: skip
-    lay(world)
+    lay(world, constraints(world) if np.any(slid.pulled_out) else replace(held, arc=slid.arc))
 
 
 def overdrawn(world: World) -> tuple[int, int, Constraints] | None:
@@ -159,10 +159,9 @@ def overdrawn(world: World) -> tuple[int, int, Constraints] | None:
     return None
 
 
-def lay(world: World) -> None:
+def lay(world: World, held: Constraints) -> None:
     """Place the thread's nodes between the constraints; a needle that nothing holds trails behind."""
     assert world.thread is not None
-    held = constraints(world)
     arc, position = held.arc, held.position
     for s0, s1 in world.pieces:
         if not np.any((arc >= s0) & (arc <= s1)):
