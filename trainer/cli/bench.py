@@ -74,36 +74,36 @@ def realtime(
 
 @app.command("speed-error")
 def speed_error(
-    quick: Annotated[bool, typer.Option("--quick", help="Below a minute: without the longest relaxations.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="About a minute: small meshes, few repetitions.")] = False,
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Where the report goes; by default reports/ if it is here.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Time against error of the ways to a vessel's equilibrium; writes speed_error.md, .svg and .json."""
+    """Time against error of every method of mechanics; writes speed_error.md, .svg and .json."""
     from trainer.bench import page
     from trainer.bench.machine import load
-    from trainer.bench.vessel import measure
     from trainer.cli.sessions import print_table
     from trainer.cli.warmup import announce
 
     folder = out or (Path("reports") if Path("reports").is_dir() else Path())
     announce()
     about = _machine()
-    rows, order = measure(quick)
+    rows = page.measure(quick)
     about["load_after"] = load()
-    written = page.write(folder, rows, order, about, quick)
+    written = page.write(folder, rows, about, quick)
     if as_json:
-        print(json.dumps(page.document(rows, order, about, quick), indent=2, allow_nan=False))
+        print(json.dumps(page.document(rows, about, quick), indent=2, allow_nan=False))
     else:
-        print_table(
-            ("case", "nodes", "method", "setting", "median ms", "p90 ms", "error / R", "residual mN", "status"),
-            [
-                (r.case, str(r.size), r.method, r.setting, page.ms(r.median_ms), page.ms(r.p90_ms), f"{r.error:.1e}",
-                 f"{r.residual:.1e}", r.status)
-                for r in rows
-            ],
-        )  # fmt: skip
+        for name, of_subject in rows.items():
+            print_table(
+                ("case", page.SUBJECTS[name].counts, "method", "setting", "median ms", "p90 ms", "error", "status"),
+                [
+                    (r.case, str(r.size), r.method, r.setting, page.ms(r.median_ms), page.ms(r.p90_ms),
+                     f"{r.error:.1e}", r.status)
+                    for r in of_subject
+                ],
+            )  # fmt: skip
     for path in written:
         typer.echo(f"written: {path}", err=True)
 

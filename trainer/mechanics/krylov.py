@@ -30,8 +30,9 @@ from trainer.mechanics.multifrontal import Multifrontal, MultifrontalFactor
 from trainer.mechanics.nested_dissection import dissect
 from trainer.mechanics.newton import Outcome, multiply, refuse_loose_nodes, refuse_not_finite
 
-#: More iterations than this in one step ask for a new factor.
-SLOW = 30
+#: More iterations than this in one step ask for a new factor, or as many as cost what the factor does: an iteration
+#: takes the time of so many arithmetic operations for each number in the factor (measured, within two).
+SLOW, ITERATION_COST = 30, 16.0
 #: Iterations after which a step ends as it is.
 MOST = 200
 #: The least accuracy of a linear solve, as a share of its right-hand side.
@@ -70,6 +71,7 @@ class NewtonKrylov:
         if not self._factoring.compute(self._block):
             raise ValueError("the links do not hold all free nodes in place: the stiffness matrix is singular")
         self._slow = False
+        self._slow_from = max(SLOW, self._factoring.operations / (ITERATION_COST * len(self._factoring.factor.panel)))
         self._free = ~mesh.fixed
         self._held = np.zeros(0, dtype=np.int64)
         self._columns = np.zeros((0, *mesh.rest.shape))
@@ -123,6 +125,17 @@ class NewtonKrylov:
             elif length == 0.0 or decrease <= noise:
                 return Outcome(False, step, residual, energy)
         return Outcome(residual <= tolerance_mN, most_steps, residual, energy)
+
+    @property
+    def held_bytes(self) -> int:
+        """What each iteration reads of memory, at least: the factor, the blocks, the columns and six vectors."""
+        panel = self._factoring.factor.panel
+        return int(panel.nbytes + self._block.nbytes + self._columns.nbytes + 6 * self.x.nbytes)
+
+    @property
+    def moved_bytes(self) -> int:
+        """What the iterations so far have read of memory, at least: each reads the factor twice."""
+        return int(self.iterations * (self.held_bytes + self._factoring.factor.panel.nbytes))
 
     def _hold(self, nodes: np.ndarray) -> None:
         """Takes ``nodes`` (k,) out of the unknowns."""
@@ -189,7 +202,7 @@ class NewtonKrylov:
             force, accuracy, radius, self._longest, self._step, self._scratch,
         )  # fmt: skip
         self.iterations += iterations
-        self._slow = iterations > SLOW
+        self._slow = iterations > self._slow_from
         return decrease, length, cut
 
     def _evaluate(self, x: Array, load: Array, force: Array) -> float:

@@ -2,9 +2,9 @@
 
 Solves Σ F = 0 at every free node with the exact second derivatives H of the energy (``links``): H p = F. Where held
 nodes have moved by d, the first step is the tangent to the path of equilibria, H p = F - H_fh d, so that all nodes go
-along with them. A step along which H is not positive is taken with the blocks' positive part instead, which always
-leads down. Each further step is shortened until the energy falls (Armijo; Nocedal and Wright, Numerical Optimization,
-algorithms 3.1 and 7.1), so that the energy never rises but by rounding.
+along with them. Where H is not positive definite, the smallest of a few multiples of the identity that makes it so is
+added, and the step leads down. Each further step is shortened until the energy falls (Armijo; Nocedal and Wright,
+Numerical Optimization, algorithms 3.1 and 3.3), so that the energy never rises but by rounding.
 
 Each system is factored anew by scipy's SuperLU: the reference for the others. ``krylov`` is for big meshes.
 """
@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from scipy.sparse import csc_matrix
+from scipy.sparse import csc_matrix, eye_array
 from scipy.sparse.linalg import SuperLU, splu
 
 from trainer.geometry import Array
@@ -25,6 +25,8 @@ from trainer.mechanics.links import LinkMesh, add_forces, link_blocks
 DECREASE, SHORTEST_STEP = 1e-4, 1e-6
 #: Share of an energy that is lost to rounding when it is summed over thousands of links.
 ROUNDING = 1e-14
+#: The first multiple of the identity that is tried, as a share of the stiffest link, and the next ones.
+FIRST_SHIFT, GROWTH = 1e-5, 4.0
 #: No node goes further in one step, in median links.
 LONGEST = 4.0
 
@@ -39,14 +41,17 @@ class Outcome:
     energy: float  # mN mm
 
 
-def factor(matrix: csc_matrix) -> tuple[SuperLU, bool]:
-    """The factors of a symmetric matrix by scipy's SuperLU, and whether they show it to be positive definite.
+def factor(matrix: csc_matrix) -> SuperLU | None:
+    """The factors of a symmetric matrix by scipy's SuperLU; None where they show it not to be positive definite.
 
     A symmetric order, and pivots from the diagonal: then the signs on U's diagonal are those of the eigenvalues
     (Sylvester's law of inertia).
     """
-    lu = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    return lu, bool(np.array_equal(lu.perm_r, lu.perm_c) and np.all(lu.U.diagonal() > 0.0))
+    try:
+        lu = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    except RuntimeError:  # a pivot of zero
+        return None
+    return lu if np.array_equal(lu.perm_r, lu.perm_c) and np.all(lu.U.diagonal() > 0.0) else None
 
 
 def sparse_matrix(mesh: LinkMesh, block: Array) -> csc_matrix:
@@ -92,7 +97,7 @@ class Newton:
         places: Array,
         *,
         tolerance_mN: float,
-        most_steps: int = 50,
+        most_steps: int = 100,
         load: Array | None = None,
     ) -> Outcome:
         """Moves ``nodes`` (k,) to ``places`` (k, 3) and all others to equilibrium under the forces ``load`` (n, 3) mN.
@@ -129,7 +134,7 @@ class Newton:
             multiply(self._block, self.mesh.links, way, self._trial_force)
             self._trial_force[~free] = 0.0
             np.subtract(self._force, self._trial_force, out=self._trial_force)
-            if self._solve(self._trial_force, free):
+            if self._solve(self._trial_force, free, 0.0):
                 trial += self._step
             trial[nodes] = places
         x[nodes] = places
@@ -144,21 +149,22 @@ class Newton:
     def _direction(self, free: np.ndarray) -> None:
         """Newton's step from ``x`` into ``_step``; it leads down."""
         m = self.mesh
-        for project in (False, True):
-            link_blocks(self.x, m.links, m.rest_length, m.stiffness, project, self._block)
-            if self._solve(self._force, free) and float(np.vdot(self._force, self._step)) > 0.0:
-                return
-        self._step[:] = self._force / float(np.max(np.abs(self._block)))  # steepest descent
+        link_blocks(self.x, m.links, m.rest_length, m.stiffness, False, self._block)
+        shift = 0.0
+        while not (self._solve(self._force, free, shift) and float(np.vdot(self._force, self._step)) > 0.0):
+            shift = max(GROWTH * shift, FIRST_SHIFT * float(np.max(m.stiffness)))
 
-    def _solve(self, force: Array, free: np.ndarray) -> bool:
-        """The step that ``_block`` answers to ``force`` with, into ``_step``; False if it is not positive definite."""
+    def _solve(self, force: Array, free: np.ndarray, shift: float) -> bool:
+        """The step that ``_block`` and a ``shift``, mN/mm, on its diagonal answer to ``force`` with, into ``_step``;
+        False if they are not positive definite."""
         at = np.flatnonzero(free)
         dof = (3 * at[:, None] + np.arange(3)).ravel()
-        lu, positive = factor(sparse_matrix(self.mesh, self._block)[dof][:, dof])
+        lu = factor(sparse_matrix(self.mesh, self._block)[dof][:, dof] + shift * eye_array(len(dof), format="csc"))
+        if lu is None:
+            return False
         self._step[:] = 0.0
-        if positive:
-            self._step[at] = lu.solve(force[at].ravel()).reshape(-1, 3)
-        return positive
+        self._step[at] = lu.solve(force[at].ravel()).reshape(-1, 3)
+        return True
 
     def _search(self, free: np.ndarray, load: Array, energy: float) -> float | None:
         """Goes along ``_step`` as far as the energy falls enough; the new energy, or None if it nowhere does."""

@@ -3,10 +3,10 @@
 A tissue that has buckled has more than one equilibrium for one place of the instrument; which one it is in depends on
 the way there. So nodes that have leapt are taken along the straight line from where they were, in sub-steps, to
 equilibrium at each. A sub-step is shorter than any link, or a node could pass through the wall behind it (a quarter of
-the shortest one: assumed). It is halved, and begun again from the last equilibrium, when a node has moved more than ``LEAP`` times as
-far as the instrument, and lengthened when it went well (step control of continuation methods: Allgower and Georg,
-Numerical Continuation Methods, section 6.1). A snap that is the tissue's own stays a leap at every sub-step: below
-``SHORTEST`` it is accepted, and counted.
+the shortest one: assumed). It is halved, and begun again from the last equilibrium, when a node has moved more than
+``LEAP`` times as far as the instrument, and lengthened when it went well (step control of continuation methods:
+Allgower and Georg, Numerical Continuation Methods, section 6.1). A snap that is the tissue's own stays a leap at every
+sub-step: below ``SHORTEST`` it is accepted, and counted.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ class Follower(Protocol):
     """A method of static equilibrium with a state, as in ``newton``, ``krylov`` and ``sweeps``."""
 
     mesh: LinkMesh
-    x: Array
 
-    def move(
-        self, nodes: np.ndarray, places: Array, *, tolerance_mN: float, load: Array | None = None
-    ) -> Outcome: ...
+    @property
+    def x(self) -> Array: ...
+
+    def move(self, nodes: np.ndarray, places: Array, *, tolerance_mN: float, load: Array | None = None) -> Outcome: ...
 
 
 @dataclass(frozen=True)
