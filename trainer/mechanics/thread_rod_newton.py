@@ -38,8 +38,7 @@ MOST_CONTACT_ITERATIONS = 100
 CLOSE = 1e-5  # link lengths: an iteration that moves no node further is the last; what it leaves is of second order
 SETTLED = 0.2  # of the change that is due: the multipliers are renewed after iterations that move no node further
 FAIR = 1e-3  # of the largest push: to this the multipliers agree with the nodes in the end
-NEARLY = 1e-3  # link lengths
-PATIENCE = 60  # iterations after which gaps and slips may be off by NEARLY, forces by 10 FAIR; lengths never are
+PATIENCE = 60  # iterations after which the multipliers stay: what gap is then left bears the rest of its push with k
 STIFF = 20.0  # a contact's k over the stiffness of the nodes it acts on; decides iterations, not the answer
 
 NEAR = 1e-3  # links: a slipping hold this close to its place has caught it
@@ -276,10 +275,8 @@ def solve(law: Law, work: Work, frame: Array, contacts: Contacts, moved: float, 
             way, share = _change_contacts(x, contacts, moved, part, work.begin, False)
             if iteration <= PATIENCE:
                 enough = enough and way <= CLOSE * law.link and share <= FAIR
-            else:
-                enough = furthest <= 10.0 * CLOSE * law.link and way <= NEARLY * law.link and share <= 10.0 * FAIR
-            if enough or furthest <= SETTLED * way:
-                _change_contacts(x, contacts, moved, part, work.begin, True)
+                if enough or furthest <= SETTLED * way:
+                    _change_contacts(x, contacts, moved, part, work.begin, True)
         if enough:
             _residual(law, work, frame, contacts, moved, part)
             return iteration
