@@ -23,7 +23,7 @@ from trainer.mechanics.dynamics import (
 )
 from trainer.mechanics.implicit_euler import BackwardEuler
 from trainer.mechanics.integrators import FORWARD_EULER, METHODS, MIDPOINT, RK4, RK4_RADIUS, Explicit, Method
-from trainer.mechanics.link_law import constant, j_shaped
+from trainer.mechanics.link_law import constant, j_shaped, settle
 from trainer.mechanics.links import LinkMesh, link_mesh, stiffness_from_modulus
 
 #: R(z) = Σ z^k / k!, up to the method's order.
@@ -316,6 +316,21 @@ def outcome() -> str:
             work.step(state, 20e-6)
         digests.append(hashlib.sha256(state.x.tobytes() + state.v.tobytes() + state.slip.tobytes()).hexdigest())
     return " ".join(digests)
+
+
+@pytest.mark.parametrize("name", [*(m.name for m in METHODS), "backward Euler"])
+def test_links_remember_where_a_step_left_them(name: str) -> None:
+    """After one substep from slip 0 each link's slip is that of link_law at its new elongation, to the last digits."""
+    made, mesh = heavy_case()
+    explicit = {m.name: Explicit(made, m, mesh.fixed) for m in METHODS}
+    work = explicit.get(name) or BackwardEuler(made, tolerance_mN=1e-6)
+    state = in_motion(mesh)
+    assert work.step(state, min(1e-6, work.stable_step_s)) == 1
+    d = state.x[mesh.links[:, 1]] - state.x[mesh.links[:, 0]]
+    slip = np.zeros(len(d))
+    settle(made.law, np.linalg.norm(d, axis=1) - mesh.rest_length, slip)
+    assert np.abs(slip).max() > 1e-7
+    assert state.slip == pytest.approx(slip, abs=1e-14)
 
 
 def test_a_run_repeats_bit_for_bit() -> None:

@@ -46,7 +46,7 @@ QUICK_STEPS_A_FRAME = (1, 10, 100)
 #: RK4's steps for the reference are so many times finer than its finest here: an error 16 times smaller.
 REFERENCE_FINER = 2
 #: Evaluations of all forces in a frame, beyond which a method is left out.
-MOST_EVALUATIONS, QUICK_MOST_EVALUATIONS = 300_000, 40_000
+MOST_EVALUATIONS, QUICK_MOST_EVALUATIONS = 100_000, 40_000
 #: Residual at which Newton's method ends, over Young's modulus, mm²: 1e-3 mN for a vessel of the tasks.
 TOLERANCE_MM2 = 2e-6
 #: What the errors are.

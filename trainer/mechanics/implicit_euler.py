@@ -186,13 +186,14 @@ def multiply(model: Model, held: np.ndarray, h: float, block: Array, p: Array, o
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def precondition(held: np.ndarray, inverse: Array, error: Array, out: Array) -> float:
-    """``out`` = the nodes' inverse blocks times ``error``, each (n, 3), filtered; returns error · out."""
+def precondition(inverse: Array, error: Array, out: Array) -> float:
+    """``out`` = the nodes' inverse blocks times ``error``, each (n, 3); returns error · out.
+
+    The error of a held node is zero from the first, so nothing is to be filtered here.
+    """
     total = 0.0
     for i in range(len(out)):
         x, y, z = error[i, 0], error[i, 1], error[i, 2]
-        if held[i]:
-            x = y = z = 0.0
         out[i, 0] = inverse[i, 0] * x + inverse[i, 1] * y + inverse[i, 2] * z
         out[i, 1] = inverse[i, 1] * x + inverse[i, 3] * y + inverse[i, 4] * z
         out[i, 2] = inverse[i, 2] * x + inverse[i, 4] * y + inverse[i, 5] * z
@@ -210,7 +211,7 @@ def conjugate_gradients(model: Model, held: np.ndarray, h: float, s: Solve, goal
     for i in range(len(s.r)):
         for c in range(3):
             s.error[i, c] = -s.r[i, c] - s.image[i, c]
-    slope = precondition(held, s.inverse, s.error, s.scaled)
+    slope = precondition(s.inverse, s.error, s.scaled)
     s.p[:] = s.scaled
     for _ in range(3 * MOST_ITERATIONS * len(s.r)):
         total = 0.0
@@ -227,7 +228,7 @@ def conjugate_gradients(model: Model, held: np.ndarray, h: float, s: Solve, goal
             for c in range(3):
                 s.step[i, c] += t * s.p[i, c]
                 s.error[i, c] -= t * s.image[i, c]
-        new_slope = precondition(held, s.inverse, s.error, s.scaled)
+        new_slope = precondition(s.inverse, s.error, s.scaled)
         share = new_slope / slope
         slope = new_slope
         for i in range(len(s.p)):

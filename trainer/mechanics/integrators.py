@@ -37,7 +37,7 @@ MOST_SUBSTEPS = 1_000_000
 
 
 class Stages(NamedTuple):
-    """What a substep needs besides the state; it is kept from step to step."""
+    """What substeps need besides the state; it is kept from step to step."""
 
     x: Array  # (n, 3) mm, positions of a stage
     v: Array  # (n, 3) mm/s, velocities of a stage
