@@ -38,7 +38,8 @@ MOST_CONTACT_ITERATIONS = 100
 CLOSE = 1e-5  # link lengths: an iteration that moves no node further is the last; what it leaves is of second order
 SETTLED = 0.2  # of the change that is due: the multipliers are renewed after iterations that move no node further
 FAIR = 1e-3  # of the largest push: to this the multipliers agree with the nodes in the end
-PATIENCE = 60  # iterations after which the multipliers stay: what gap is then left bears the rest of its push with k
+PATIENCE = 60  # iterations after which an obstacle's multipliers stay, and two links' forces; lengths are found anyway
+SOFT = 4.0  # the same for two links, over their inertia
 STIFF = 20.0  # a contact's k over the stiffness of the nodes it acts on; decides iterations, not the answer
 
 NEAR = 1e-3  # links: a slipping hold this close to its place has caught it
@@ -236,6 +237,9 @@ def solve(law: Law, work: Work, frame: Array, contacts: Contacts, moved: float, 
         _residual(law, work, frame, contacts, moved, part)
         for k in range(contacts.used[0]):  # as stiff as the tensions have made the nodes by now
             i = contacts.link[k]
+            if contacts.other[k] >= 0:  # not stiffer than inertia can answer: these two wait for one another
+                contacts.stiff[k] = SOFT * work.weight[i] if iteration <= PATIENCE else 0.0
+                continue
             stiff = work.weight[i] + 6.0 * law.bend + 2.0 * max(abs(tension[i]), abs(tension[i + 1])) / law.link
             contacts.stiff[k] = STIFF * stiff if iteration == 1 else max(contacts.stiff[k], STIFF * stiff)
         for compression in range(2):
@@ -270,13 +274,12 @@ def solve(law: Law, work: Work, frame: Array, contacts: Contacts, moved: float, 
                 x[i, c] += step * work.b[4 * i + c]
             tension[i] += step * work.b[4 * i + 3]
         enough = furthest <= CLOSE * law.link
-        if touching:
+        if touching and iteration <= PATIENCE:
             # The multipliers wait until the nodes have answered to the last ones: k makes much of a small gap.
             way, share = _change_contacts(x, contacts, moved, part, work.begin, False)
-            if iteration <= PATIENCE:
-                enough = enough and way <= CLOSE * law.link and share <= FAIR
-                if enough or furthest <= SETTLED * way:
-                    _change_contacts(x, contacts, moved, part, work.begin, True)
+            enough = enough and way <= CLOSE * law.link and share <= FAIR
+            if enough or furthest <= SETTLED * way:
+                _change_contacts(x, contacts, moved, part, work.begin, True)
         if enough:
             _residual(law, work, frame, contacts, moved, part)
             return iteration
