@@ -54,7 +54,7 @@ def test_the_factor_found_is_the_best_one_for_a_known_spectral_radius(free: int)
 
 
 def test_the_formula_inverts_the_ratio_that_it_is_made_from() -> None:
-    """For ω below the best one the slowest ratio η solves (η + ω - 1)² = η ω² ρ²; the formula finds ρ, hence ω_best."""
+    """For ω below the best one the slowest ratio η solves (η + ω - 1)² = η ω² ρ²; the formula finds ρ and the best."""
     rho = 0.99
     best = 2.0 / (1.0 + math.sqrt(1.0 - rho**2))
     for omega in (1.0, 1.3, 1.6):
@@ -62,7 +62,7 @@ def test_the_formula_inverts_the_ratio_that_it_is_made_from() -> None:
         found, final = better_factor(omega, root**2)
         assert not final
         assert found == pytest.approx(best - 0.25 * (2.0 - best), rel=1e-9)
-    assert better_factor(1.9, 0.9) == (1.9, True)  # η = ω - 1: ω is the best or above, and the ratio says no more
+    assert better_factor(1.9, 0.89) == (1.9, True)  # η < ω - 1: ω is above the best, and η says no more
 
 
 def test_no_sweep_raises_the_energy_however_far_and_stiff() -> None:

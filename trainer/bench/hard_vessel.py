@@ -15,7 +15,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from trainer.bench.vessel import SPRING, Work, prepare, residual_mN
+from trainer.bench.vessel import Work, prepare, residual_mN
 from trainer.geometry import Array
 from trainer.mechanics.attachments import Anchors
 from trainer.mechanics.equilibrium import Equilibrium
@@ -32,6 +32,8 @@ TOLERANCE_mN = 1e-4
 MEASURED = 10.0
 #: An answer on the right branch is nearer than this, radii; other branches are 0.2 and more away (facts of the cases).
 BRANCH = 1e-2
+#: The kept factor draws nodes by springs, mN/mm, which give way by less than PLACED_mm under 10 mN.
+SPRING, PLACED_mm = 1e6, 1e-5
 #: Sub-steps of the reference for a way of one radius.
 FINE = 200
 
@@ -44,7 +46,7 @@ class Relaxation:
 
     def move(self, nodes: np.ndarray, places: Array, *, tolerance_mN: float, load: Array | None = None) -> Outcome:
         self.x[nodes] = places
-        ended = relax(self.mesh, self.x, nodes, tolerance_mN=tolerance_mN, most_sweeps=100_000, load=load)
+        ended = relax(self.mesh, self.x, nodes, tolerance_mN=tolerance_mN, most_sweeps=20_000, load=load)
         return Outcome(ended.converged, ended.sweeps, ended.residual_mN, energy(self.mesh, self.x))
 
 
@@ -213,7 +215,7 @@ def outcome(case: str, method: str) -> str:
     left = residual_mN(hard.mesh, x, free)
     if not all(path.converged for path in ended):
         return f"not converged: residual {left:.1e} mN"
-    assert np.allclose(x[hard.nodes], hard.ways[-1], atol=1e-6), "a node is not where it was taken"
+    assert np.allclose(x[hard.nodes], hard.ways[-1], atol=PLACED_mm), "a node is not where it was taken"
     assert left <= MEASURED * TOLERANCE_mN, f"residual {left:.1e} mN, and it says that it converged"
     moved = hard.mesh.rest.copy()
     moved[hard.nodes] = hard.ways[-1]

@@ -33,6 +33,8 @@ from trainer.mechanics.newton import Outcome, multiply, refuse_loose_nodes, refu
 #: More iterations than this in one step ask for a new factor, or as many as cost what the factor does: an iteration
 #: takes the time of so many arithmetic operations for each number in the factor (measured, within two).
 SLOW, ITERATION_COST = 30, 16.0
+#: So many times as many iterations in all steps of one move do so, too: the region of trust is measured by the factor.
+MANY = 3
 #: Iterations after which a step ends as it is.
 MOST = 200
 #: The least accuracy of a linear solve, as a share of its right-hand side.
@@ -71,6 +73,7 @@ class NewtonKrylov:
         if not self._factoring.compute(self._block):
             raise ValueError("the links do not hold all free nodes in place: the stiffness matrix is singular")
         self._slow = False
+        self._spent = 0  # iterations of this move with this factor
         self._slow_from = max(SLOW, self._factoring.operations / (ITERATION_COST * len(self._factoring.factor.panel)))
         self._free = ~mesh.fixed
         self._held = np.zeros(0, dtype=np.int64)
@@ -88,7 +91,7 @@ class NewtonKrylov:
         places: Array,
         *,
         tolerance_mN: float,
-        most_steps: int = 100,
+        most_steps: int = 200,
         load: Array | None = None,
     ) -> Outcome:
         """Moves ``nodes`` (k,) to ``places`` (k, 3) and all others to equilibrium under the forces ``load`` (n, 3) mN.
@@ -97,6 +100,7 @@ class NewtonKrylov:
         """
         refuse_not_finite(places, load)
         load = np.zeros_like(self.x) if load is None else load
+        self._spent = 0
         self._hold(nodes)
         energy = self._predict(nodes, places, load)
         first = residual = float(np.linalg.norm(self._force))
@@ -163,6 +167,7 @@ class NewtonKrylov:
         m = self.mesh
         if self._slow:
             self._slow = False
+            self._spent = 0
             self.factors += 1
             for positive_part in (False, True):
                 link_blocks(self.x, m.links, m.rest_length, m.stiffness, positive_part, self._block)
@@ -202,7 +207,8 @@ class NewtonKrylov:
             force, accuracy, radius, self._longest, self._step, self._scratch,
         )  # fmt: skip
         self.iterations += iterations
-        self._slow = iterations > self._slow_from
+        self._spent += iterations
+        self._slow = iterations > self._slow_from or self._spent > MANY * self._slow_from
         return decrease, length, cut
 
     def _evaluate(self, x: Array, load: Array, force: Array) -> float:

@@ -100,10 +100,18 @@ class BlockSweeps:
             self.omega, self._known = better_factor(self.omega, eta)
 
     def _breadth_first(self, nodes: np.ndarray, most_links: int | None) -> np.ndarray:
-        """The order of the sweeps, kept while the same nodes are moved."""
+        """The order of the sweeps, kept while the same nodes are moved.
+
+        Without a region's limit it ends with the nodes that no link joins to the moved ones: a load may move them.
+        """
         key = np.asarray(nodes, dtype=np.int64).tobytes()
         if self._order is None or self._order[:2] != (key, most_links):
-            self._order = (key, most_links, breadth_first(self.mesh, nodes, most_links))
+            order = breadth_first(self.mesh, nodes, most_links)
+            if most_links is None:
+                left = ~self.mesh.fixed
+                left[nodes] = left[order] = False
+                order = np.concatenate([order, np.flatnonzero(left).astype(np.int32)])
+            self._order = (key, most_links, order)
         return self._order[2]
 
     def _evaluate(self, order: np.ndarray, load: Array) -> tuple[float, float]:
