@@ -27,6 +27,9 @@ class Subject:
 #: Each has ``measure(quick) -> list[Row]``.
 SUBJECTS = {
     "vessel": Subject("A vessel's static equilibrium", "nodes", 1e-4),
+    "integrators": Subject("A swinging vessel", "nodes", 1e-2),
+    "thread": Subject("A thread", "links", 5e-3),
+    "contact": Subject("Contact search", "triangles or segments", 0.0),
 }
 
 Rows = Mapping[str, Sequence[Row]]
