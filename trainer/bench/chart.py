@@ -38,7 +38,15 @@ def chart(rows: Mapping[str, Sequence[Row]], counts: Mapping[str, str]) -> str:
     for name, of_subject in drawn.items():
         for case in dict.fromkeys(r.case for r in of_subject):
             x0, y0 = len(panels) % 2 * WIDTH, len(panels) // 2 * HEIGHT
-            panels.append(_panel(x0, y0, f"{name}: {case}", counts[name], [r for r in of_subject if r.case == case]))
+            panels.append(
+                _panel(
+                    x0,
+                    y0,
+                    case if case.startswith(name) else f"{name}: {case}",
+                    counts[name],
+                    [r for r in of_subject if r.case == case],
+                )
+            )
     width, height = 2.0 * WIDTH, max(math.ceil(len(panels) / 2), 1) * HEIGHT
     return drawing(
         width,
@@ -86,11 +94,12 @@ def _panel(x0: float, y0: float, title: str, counts: str, rows: list[Row]) -> li
         colour = COLOURS[k % len(COLOURS)]
         parts.append(text(at, y0 + 36.0 + 15.0 * (k % 2), method, fill=colour))
         at += (WIDTH - LEFT - RIGHT) / 3.0 if k % 2 else 0.0
-        for size in sizes:
+        for rank, size in enumerate(sizes):
+            radius = 2.0 + rank  # a method with one setting has no line to tell its size
             points = [(x(r.median_ms), y(r.error)) for r in rows if (r.method, r.size) == (method, size)]
             dashes = dash.get(size, "none")
             parts.append(polyline(points, stroke=colour, stroke_width=2.0, stroke_dasharray=dashes))
-            parts += [element("circle", cx=px, cy=py, r=3.0, fill=colour) for px, py in points]
+            parts += [element("circle", cx=px, cy=py, r=radius, fill=colour) for px, py in points]
     return parts
 
 
