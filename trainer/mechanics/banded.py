@@ -58,11 +58,9 @@ def factor_band(
     diagonal: Array,
     columns: np.ndarray,
     inverse: Array,
-    first: int,
-    last: int,
     least: float,
 ) -> int:
-    """L D Lᵀ, L with unit diagonal: the columns ``first`` … ``last`` - 1, given those before (left-looking).
+    """L D Lᵀ, L with unit diagonal, column by column from those before it (left-looking).
 
     ``band`` (3 f, b + 1 + GROUP) holds K as in :func:`assemble_band`, with zeros in its last columns, and is
     overwritten with D Lᵀ. ``columns[j, k]`` is L[j + 1 + k, j], ``inverse[j]`` is 1 / D[j]. A pivot that is below the
@@ -71,7 +69,7 @@ def factor_band(
     """
     n, b = columns.shape
     replaced = 0
-    for j in range(first, last):
+    for j in range(n):
         size = min(b, n - 1 - j) + 1
         i = max(0, j - b)
         while i + GROUP <= j:  # written out below for a GROUP of four
@@ -182,52 +180,47 @@ def solve(kept: BandedFactor, values: Array, v: np.ndarray, out: Array) -> None:
     scatter(u, kept.order, out)
 
 
-class Factoring:
-    """A factorisation that can be done a little at a time, and again: its memory is kept."""
+class Band(NamedTuple):
+    """Where a matrix of one topology is factored, again and again."""
 
-    def __init__(self, links: np.ndarray, order: np.ndarray, node_count: int) -> None:
-        """Of a stiffness that the ``links`` (m, 2) add up to on the nodes ``order`` (f,)."""
-        self._place = np.full(node_count, -1, dtype=np.int32)
-        self._place[order] = np.arange(len(order), dtype=np.int32)
-        self._links = links
-        ends = self._place[links]
-        ends = ends[np.all(ends >= 0, axis=1)]
-        reach = int(np.max(np.abs(ends[:, 1] - ends[:, 0]), initial=0))
-        size = 3 * len(order)
-        b = min(3 * reach + 2, size - 1)
-        # Written now: a page of memory that is touched for the first time costs time, milliseconds for these.
-        self._band = np.full((size, b + 1 + GROUP), 0.0)
-        self._diagonal = np.zeros(size)
-        self._next = 0
-        columns = np.full((size, b), 0.0, dtype=np.float32)
-        self.factor = BandedFactor(np.ascontiguousarray(order, dtype=np.int32), columns, np.zeros(size))
-        self.replaced = 0  # pivots that were too small: the factor is of no use
+    links: np.ndarray  # (m, 2) int32
+    place: np.ndarray  # (n,) int32, a node's position in the order of elimination, or -1
+    values: Array  # (3 f, b + 1 + GROUP)
+    diagonal: Array  # (3 f,)
 
-    def begin(self, blocks: Array) -> None:
-        """Of the link blocks (m, 3, 3); ``factor`` is overwritten."""
-        self._band[:] = 0.0
-        assemble_band(blocks, self._links, self._place, self._band)
-        self._diagonal[:] = self._band[:, 0]
-        self._next = self.replaced = 0
 
-    def advance(self, count: int, least: float = SINGULAR) -> bool:
-        """Eliminates ``count`` more unknowns; True when ``factor`` is complete. ``least``: see factor_band."""
-        f = self.factor
-        last = min(self._next + count, len(f.inverse))
-        self.replaced += factor_band(self._band, self._diagonal, f.columns, f.inverse, self._next, last, least)
-        self._next = last
-        return last == len(f.inverse)
+def room(links: np.ndarray, order: np.ndarray, node_count: int) -> tuple[Band, BandedFactor]:
+    """For factors of a stiffness that the ``links`` (m, 2) add up to on the nodes ``order`` (f,)."""
+    place = np.full(node_count, -1, dtype=np.int32)
+    place[order] = np.arange(len(order), dtype=np.int32)
+    ends = place[links]
+    ends = ends[np.all(ends >= 0, axis=1)]
+    reach = int(np.max(np.abs(ends[:, 1] - ends[:, 0]), initial=0))
+    size = 3 * len(order)
+    b = min(3 * reach + 2, size - 1)
+    # Written now: a page of memory that is touched for the first time costs time, milliseconds for these.
+    band = Band(np.ascontiguousarray(links), place, np.full((size, b + 1 + GROUP), 0.0), np.zeros(size))
+    columns = np.full((size, b), 0.0, dtype=np.float32)
+    return band, BandedFactor(np.ascontiguousarray(order, dtype=np.int32), columns, np.zeros(size))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def factor_blocks(blocks: Array, band: Band, out: BandedFactor, least: float) -> int:
+    """Overwrites ``out`` with the factor of the link blocks (m, 3, 3); returns how many pivots were too small, see
+    :func:`factor_band`."""
+    band.values[:] = 0.0
+    assemble_band(blocks, band.links, band.place, band.values)
+    band.diagonal[:] = band.values[:, 0]
+    return factor_band(band.values, band.diagonal, out.columns, out.inverse, least)
 
 
 def factor(blocks: Array, links: np.ndarray, order: np.ndarray, node_count: int) -> BandedFactor:
-    """The whole factor at once, see Factoring.
+    """The factor of the link blocks (m, 3, 3) on the nodes ``order``.
 
     Raises ValueError when the matrix is not positive definite, that is when the nodes can move without
     stretching a link.
     """
-    work = Factoring(links, order, node_count)
-    work.begin(blocks)
-    work.advance(3 * len(order))
-    if work.replaced:
+    band, out = room(links, order, node_count)
+    if factor_blocks(blocks, band, out, SINGULAR):
         raise ValueError("the links do not hold all free nodes in place: the stiffness matrix is singular")
-    return work.factor
+    return out

@@ -7,10 +7,14 @@ happens depends on what was solved, never on how fast the machine is.
 
 from __future__ import annotations
 
+import os
+import sys
+import threading
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 from trainer.geometry import Array
 from trainer.mechanics import banded
@@ -18,31 +22,25 @@ from trainer.mechanics.links import LinkMesh, link_blocks
 from trainer.mechanics.quasi_newton import at_points
 
 #: A new factor is taken so many solves after it was begun.
-LAG = 3
+LAG = 4
 #: Solves for which a new factor is used before another one of the same body may be begun.
-LASTS = 2
+LASTS = 10
 #: At rest no pivot is below 0.4 of the diagonal. A state in which one is below this is nearly or truly unstable.
 LEAST_PIVOT = 0.05
 #: In place of a slot's body: the slot holds nothing.
 FREE = -1
 
 
-class _Scratch:
-    """What a thread overwrites in a solve."""
-
-    def __init__(self, mesh: LinkMesh, orders: tuple[np.ndarray, ...]) -> None:
-        self.push = np.zeros((len(mesh.rest), 3))
-        self.v = np.zeros(3 * max(len(order) for order in orders), dtype=np.float32)
-
-
-@dataclass(frozen=True)
+@dataclass
 class _Renewal:
-    """A body's next factor as it will be, and whom it will answer."""
+    """A body's next factor, and the points that it will answer."""
 
     body: int
-    due: int  # solves from its beginning until it is taken
-    points: dict[int, tuple[np.ndarray, Array]]  # slot → its nodes and weights when the renewal began
-    columns: Future[dict[int, Array]]  # slot → (3, n, 3) mm/mN; the factor is complete when they are
+    due: int  # the number of the solve after which it is taken
+    slots: np.ndarray  # (k,) held when it was begun …
+    nodes: np.ndarray  # (k, 3)
+    weights: Array  # (k, 3) … at these points
+    done: Future[None] | None = None  # the thread's work
 
 
 class Compliance:
@@ -62,24 +60,32 @@ class Compliance:
         body = self.body_of(mesh.links.min(axis=1))
         at = [np.flatnonzero(body == b) for b in range(len(orders))]
         self.links = [(int(r[0]), int(r[-1]) + 1) for r in at]
+        # What the thread writes is there, and was written to, before it begins: to be given fresh memory takes a system
+        # milliseconds now and then, in which nothing else goes on.
+        rooms = [banded.room(mesh.links[lo:hi], orders[b], n) for b, (lo, hi) in enumerate(self.links)]
+        self._bands, self._next = [band for band, _ in rooms], [factor for _, factor in rooms]
+        self._blocks = np.full((max(hi - lo for lo, hi in self.links), 3, 3), 0.0)
+        self._at = mesh.rest.copy()  # the state of the factor under way
         self.factors = [
-            banded.factor(self._stiffness(b, mesh.rest, False), mesh.links[lo:hi], orders[b], n)
+            banded.factor(self._blocks_at_rest(b), mesh.links[lo:hi], orders[b], n)
             for b, (lo, hi) in enumerate(self.links)
         ]
-        # Each body's next factor, and what the thread that makes it works with.
-        self._next = [banded.Factoring(mesh.links[lo:hi], orders[b], n) for b, (lo, hi) in enumerate(self.links)]
-        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="factor")
-        self._here, self._there = _Scratch(mesh, orders), _Scratch(mesh, orders)
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="factor", initializer=_give_way)
+        unknowns = 3 * max(len(order) for order in orders)
+        self._push, self._v = np.zeros((n, 3)), np.zeros(unknowns, dtype=np.float32)
+        self._thread_push, self._thread_v = self._push.copy(), self._v.copy()
         self._free: list[int] = []
         self.slot_nodes = np.zeros((0, 3), dtype=np.int64)
         self.slot_weights = np.zeros((0, 3))
         self.slot_body: list[int] = []  # FREE for a slot that is
         self.slot_range = np.zeros((0, 2), dtype=np.int64)  # rows of the nodes of the slot's body
         self.columns = np.zeros((0, 3, n, 3))  # K⁻¹ Wᵀ, mm per mN
+        self._next_columns = self.columns
         self.matrix = np.zeros((0, 0))  # W K⁻¹ Wᵀ over all slots
         self._age = [LASTS] * len(orders)  # how many solves ago each body's factor was made
         self._renewal: _Renewal | None = None  # under way
         self._solves = 0
+        self._more_slots()
 
     def body_of(self, node: np.ndarray | int) -> np.ndarray:
         """The body to which a node (or each of some nodes) belongs."""
@@ -95,7 +101,9 @@ class Compliance:
         self.slot_weights[slot] = weights
         self.slot_range[slot] = self.nodes[body]
         self.slot_body[slot] = body
-        _answers(nodes, weights, self.factors[body], self.columns[slot], self._here)
+        answers(
+            self.slot_nodes[slot], self.slot_weights[slot], self.factors[body], self._push, self._v, self.columns[slot]
+        )
         self._couple(slot)
         return slot
 
@@ -114,55 +122,58 @@ class Compliance:
         body = max(bodies, key=lambda b: (self._age[b], -b))
         if self._age[body] < LASTS:
             return
-        points = {
-            slot: (self.slot_nodes[slot].copy(), self.slot_weights[slot].copy())
-            for slot, of in enumerate(self.slot_body)
-            if of == body
-        }
-        columns = self._thread.submit(self._renew, body, x.copy(), points)
-        self._renewal = _Renewal(body, self._solves + LAG, points, columns)
+        slots = np.array([slot for slot, of in enumerate(self.slot_body) if of == body], dtype=np.int64)
+        self._at[:] = x
+        self._renewal = _Renewal(
+            body, self._solves + LAG, slots, self.slot_nodes[slots].copy(), self.slot_weights[slots].copy()
+        )
+
+    def start(self) -> None:
+        """Sets the thread to the work that :meth:`refresh` prepared. To be called when the caller is about to be busy
+        in a kernel: one that goes on in Python wakes the thread on its own core, and waits for it."""
+        renewal = self._renewal
+        if renewal is None or renewal.done is not None:
+            return
+        m, (lo, hi) = self._mesh, self.links[renewal.body]
+        renewal.done = self._thread.submit(
+            renew, self._at, m.links[lo:hi], m.rest_length[lo:hi], m.stiffness[lo:hi], self._blocks[: hi - lo],
+            self._bands[renewal.body], self._next[renewal.body], renewal.slots, renewal.nodes, renewal.weights,
+            self._thread_push, self._thread_v, self._next_columns,
+        )  # fmt: skip
 
     def advance(self) -> None:
-        """Counts a solve; when the work that :meth:`refresh` began is due, takes the new factor and columns."""
+        """Counts a solve; when the work that :meth:`refresh` prepared is due, takes the new factor and columns."""
         self._solves += 1
         self._age = [age + 1 for age in self._age]
         renewal = self._renewal
         if renewal is None or self._solves < renewal.due:
             return
-        body, columns = renewal.body, renewal.columns.result()
-        (lo, hi), work = self.nodes[body], self._next[body]
-        self.factors[body], work.factor = work.factor, self.factors[body]
+        self._finish(renewal)
+        body = renewal.body
+        lo, hi = self.nodes[body]
+        self.factors[body], self._next[body] = self._next[body], self.factors[body]
+        known = {int(s): (n, w) for s, n, w in zip(renewal.slots, renewal.nodes, renewal.weights, strict=True)}
         held = [slot for slot, of in enumerate(self.slot_body) if of == body]
         for slot in held:
             nodes, weights = self.slot_nodes[slot], self.slot_weights[slot]
-            if slot in columns and all(map(np.array_equal, renewal.points[slot], (nodes, weights))):
-                self.columns[slot, :, lo:hi] = columns[slot][:, lo:hi]
+            if slot in known and all(map(np.array_equal, known[slot], (nodes, weights))):
+                self.columns[slot, :, lo:hi] = self._next_columns[slot, :, lo:hi]
             else:  # held since the renewal began
-                _answers(nodes, weights, self.factors[body], self.columns[slot], self._here)
+                answers(nodes, weights, self.factors[body], self._push, self._v, self.columns[slot])
         for slot in held:
             self._couple(slot)
         self._age[body] = 0
         self._renewal = None
 
-    def _renew(self, body: int, x: Array, points: dict[int, tuple[np.ndarray, Array]]) -> dict[int, Array]:
-        """In the thread: the body's factor at ``x`` (n, 3), and the columns of the points held."""
-        work = self._next[body]
-        work.begin(self._stiffness(body, x, False))
-        work.advance(len(work.factor.inverse), LEAST_PIVOT)
-        if work.replaced:
-            # Shortened links make the plain stiffness indefinite here; without their softening it is not.
-            work.begin(self._stiffness(body, x, True))
-            work.advance(len(work.factor.inverse), LEAST_PIVOT)
-        columns = {slot: np.zeros(self.columns.shape[1:]) for slot in points}
-        for slot, (nodes, weights) in points.items():
-            _answers(nodes, weights, work.factor, columns[slot], self._there)
-        return columns
+    def _finish(self, renewal: _Renewal) -> None:
+        self.start()
+        assert renewal.done is not None
+        renewal.done.result()
 
-    def _stiffness(self, body: int, x: Array, project: bool) -> Array:
-        """The blocks (m, 3, 3) of the body's links at ``x``."""
+    def _blocks_at_rest(self, body: int) -> Array:
         m, (lo, hi) = self._mesh, self.links[body]
-        out = np.zeros((hi - lo, 3, 3))
-        link_blocks(x, m.links[lo:hi], m.rest_length[lo:hi], m.stiffness[lo:hi], project, out)
+        out = self._blocks[: hi - lo]
+        link_blocks(m.rest, m.links[lo:hi], m.rest_length[lo:hi], m.stiffness[lo:hi], False, out)
         return out
 
     def _couple(self, slot: int) -> None:
@@ -174,29 +185,67 @@ class Compliance:
 
     def _more_slots(self) -> None:
         old = len(self.slot_nodes)
-        new = max(8, 2 * old)
+        new = max(16, 2 * old)
+        if self._renewal is not None:
+            self._finish(self._renewal)  # it writes to the columns that are about to be moved
         self._free = list(range(old, new))
         self.slot_body += [FREE] * (new - old)
         self.slot_nodes = _grown(self.slot_nodes, (new, 3))
         self.slot_weights = _grown(self.slot_weights, (new, 3))
         self.slot_range = _grown(self.slot_range, (new, 2))
         self.columns = _grown(self.columns, (new, *self.columns.shape[1:]))
+        self._next_columns = _grown(self._next_columns, self.columns.shape)
         self.matrix = _grown(self.matrix, (3 * new, 3 * new))
 
 
-def _answers(nodes: np.ndarray, weights: Array, factor: banded.BandedFactor, out: Array, scratch: _Scratch) -> None:
+def _give_way() -> None:
+    """Where threads have priorities of their own (Linux), this one yields to the solves, which often share its core."""
+    if sys.platform == "linux":
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def answers(
+    nodes: np.ndarray, weights: Array, factor: banded.BandedFactor, push: Array, v: np.ndarray, out: Array
+) -> None:
     """The displacements ``out`` (3, n, 3) of all nodes by a unit force along x, y and z on the mean of ``nodes`` (3,)
-    with ``weights`` (3,)."""
-    out[:] = 0.0
-    push = scratch.push
+    with ``weights`` (3,). ``push`` (n, 3) is zero, and is left so; overwrites ``v``, see :func:`banded.solve`."""
     for r in range(3):
-        push[nodes] = 0.0
-        np.add.at(push[:, r], nodes, weights)
-        banded.solve(factor, push, scratch.v, out[r])
-    push[nodes] = 0.0
+        for k in range(3):
+            push[nodes[k], r] += weights[k]
+        out[r] = 0.0
+        banded.solve(factor, push, v, out[r])
+        for k in range(3):
+            push[nodes[k], r] = 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def renew(
+    x: Array,
+    links: np.ndarray,
+    rest_length: Array,
+    stiffness: Array,
+    blocks: Array,
+    band: banded.Band,
+    factor: banded.BandedFactor,
+    slots: np.ndarray,
+    nodes: np.ndarray,
+    weights: Array,
+    push: Array,
+    v: np.ndarray,
+    columns: Array,
+) -> None:
+    """A body's ``factor`` at ``x`` (n, 3), and the ``columns`` (slots, 3, n, 3) of the points in ``slots`` (k,)."""
+    link_blocks(x, links, rest_length, stiffness, False, blocks)
+    if banded.factor_blocks(blocks, band, factor, LEAST_PIVOT):
+        # Shortened links make the plain stiffness indefinite here; without their softening it is not.
+        link_blocks(x, links, rest_length, stiffness, True, blocks)
+        banded.factor_blocks(blocks, band, factor, LEAST_PIVOT)
+    for k in range(len(slots)):
+        answers(nodes[k], weights[k], factor, push, v, columns[slots[k]])
 
 
 def _grown(a: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    out = np.zeros(shape, dtype=a.dtype)
+    out = np.full(shape, a.dtype.type(0))
     out[tuple(slice(0, k) for k in a.shape)] = a
     return out

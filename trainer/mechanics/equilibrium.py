@@ -24,7 +24,7 @@ from trainer.mechanics.minimise import Base, Bodies, Held, Memory, approach
 #: Secant pairs kept from one solve to the next: fewer take more iterations where a thread draws at the tissue.
 PAIRS = 8
 #: More iterations than this in a solve: the kept factor no longer serves, begin a new one.
-SLOW = 5
+SLOW = 6
 
 
 @dataclass(frozen=True)
@@ -163,6 +163,7 @@ class Equilibrium:
             before = self._last_target.get(slot)
             way[n] = rows.target[n] - (self.position(slot) if before is None else before)
         anchor_force, tension = np.zeros_like(way), np.zeros(len(cables))
+        self.compliance.start()
         converged, iterations, steps, residual, reached = approach(
             self.x, self._bodies, self._base(), rows, held, self._memory, way, np.zeros(len(cables)), tolerance_mN,
             max_iterations, anchor_force, tension,
