@@ -240,6 +240,7 @@ class Equilibrium:
                 stretch=np.zeros(c),
                 moved=np.zeros((PAIRS, u, 3)),
                 pulled=np.zeros((PAIRS, u, 3)),
+                rest=np.zeros((u, 3)),
                 answer=np.zeros((u, 3)),
                 at=np.zeros((u, 3)),
                 system=np.zeros((3 * u, 3 * u)),

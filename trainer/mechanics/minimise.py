@@ -16,7 +16,16 @@ from trainer.geometry import Array
 from trainer.mechanics import banded
 from trainer.mechanics.attachments import Rows, pull
 from trainer.mechanics.links import add_forces
-from trainer.mechanics.quasi_newton import add_scaled, after_base, at_points, before_base, dot, hold_base, spread
+from trainer.mechanics.quasi_newton import (
+    add_scaled,
+    after_base,
+    at_points,
+    balance,
+    before_base,
+    dot,
+    hold_base,
+    spread,
+)
 
 #: A target further away than this, mm, is approached in steps of this size, so that the tissue follows its path …
 STEP_MM = 0.1
@@ -87,6 +96,7 @@ class Held(NamedTuple):
     stretch: Array  # (c,) mm
     moved: Array  # (pairs, u, 3)
     pulled: Array  # (pairs, u, 3)
+    rest: Array  # (u, 3) mN
     answer: Array  # (u, 3)
     at: Array  # (u, 3)
     system: Array  # (3 u, 3 u)
@@ -136,15 +146,21 @@ def direction(bodies: Bodies, base: Base, rows: Rows, held: Held, memory: Memory
     """A step towards the energy's minimum into ``memory.z``, from ``memory.g``; returns the slope along it, mN mm."""
     q, z = memory.q, memory.z
     for b in held.awake:
-        q[bodies.nodes[b, 0] : bodies.nodes[b, 1]] = memory.g[bodies.nodes[b, 0] : bodies.nodes[b, 1]]
+        for i in range(bodies.nodes[b, 0], bodies.nodes[b, 1]):
+            for c in range(3):
+                q[i, c] = 0.0 if bodies.fixed[i] else -memory.force[i, c]
+    for i in range(len(held.force)):
+        for c in range(3):
+            held.rest[i, c] = -held.force[i, c]
     before_base(
-        q, memory.s, memory.y, memory.product, memory.newest, memory.known, held.matrix, held.nodes, held.weights,
-        held.awake, bodies.nodes, held.moved, held.pulled, held.curvature, held.share,
+        q, held.rest, memory.s, memory.y, memory.product, memory.newest, memory.known, held.matrix, held.nodes,
+        held.weights, held.awake, bodies.nodes, held.moved, held.pulled, held.curvature, held.share,
     )  # fmt: skip
+    balance(q, held.rest, held.nodes, held.weights)
     for b in held.awake:
         banded.solve(base.factors[b], q, memory.v, z)
     hold_base(
-        z, rows.slots, held.nodes, held.weights, base.columns, base.slot_range, base.matrix, held.matrix,
+        z, held.rest, rows.slots, held.nodes, held.weights, base.columns, base.slot_range, base.matrix, held.matrix,
         held.at, held.answer, held.system,
     )  # fmt: skip
     after_base(

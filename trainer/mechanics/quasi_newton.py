@@ -86,6 +86,7 @@ def multiply(matrix: Array, v: Array, out: Array) -> None:
 @njit(cache=True, nogil=True, error_model="numpy")
 def before_base(
     q: Array,
+    f: Array,
     s: Array,
     y: Array,
     product: Array,
@@ -101,7 +102,7 @@ def before_base(
     curvature: Array,
     share: Array,
 ) -> None:
-    """The first loop: overwrites the gradient ``q`` (n, 3), newest pair first.
+    """The first loop: overwrites the gradient, ``q`` (n, 3) at nodes and ``f`` (u, 3) at points, newest pair first.
 
     ``s``, ``y`` (m, n, 3) hold each body's pairs, in the rows ``span`` (bodies, 2) of its nodes, in a ring that ends at
     ``newest`` (bodies,) and has ``known`` (bodies,) in it; ``product`` (bodies, m) is s · y. What is held may join the
@@ -124,19 +125,44 @@ def before_base(
         curvature[age] = c
         if not c > 0.0:
             continue
-        share[age] = 0.0
+        along = 0.0
+        for i in range(len(nodes)):
+            for r in range(3):
+                along += moved[age, i, r] * f[i, r]
         for b in awake:
             if age < known[b]:
-                share[age] += dot(s[(newest[b] - age) % pairs], q, span[b, 0], span[b, 1]) / c
+                along += dot(s[(newest[b] - age) % pairs], q, span[b, 0], span[b, 1])
+        share[age] = along / c
         for b in awake:
             if age < known[b]:
                 add_scaled(-share[age], y[(newest[b] - age) % pairs], q, span[b, 0], span[b, 1])
-        spread(-share[age], pulled[age], nodes, weights, q)
+        for i in range(len(nodes)):
+            for r in range(3):
+                f[i, r] -= share[age] * pulled[age, i, r]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def balance(q: Array, f: Array, nodes: np.ndarray, weights: Array) -> None:
+    """Leaves q + Wᵀ f as it is, and makes ``q`` (n, 3) small at the nodes of the points: ``f`` (u, 3) takes it up.
+
+    The base's answer to q has single precision. Near equilibrium what holds a point takes up what the links pull there,
+    and far from it a stiff hold pushes a million times harder: in either case q should be the small part.
+    """
+    for i in range(len(nodes)):
+        squared = weights[i, 0] ** 2 + weights[i, 1] ** 2 + weights[i, 2] ** 2
+        for c in range(3):
+            part = 0.0
+            for k in range(3):
+                part += weights[i, k] * q[nodes[i, k], c] / squared
+            f[i, c] += part
+            for k in range(3):
+                q[nodes[i, k], c] -= weights[i, k] * part
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def hold_base(
     z: Array,
+    f: Array,
     slots: np.ndarray,
     nodes: np.ndarray,
     weights: Array,
@@ -148,13 +174,17 @@ def hold_base(
     answer: Array,
     system: Array,
 ) -> None:
-    """Turns z = K⁻¹ q (n, 3) into (K + Wᵀ A W)⁻¹ q = z - K⁻¹ Wᵀ (I + A C)⁻¹ A W z, with C = W K⁻¹ Wᵀ.
+    """Turns z = K⁻¹ q (n, 3) into (K + Wᵀ A W)⁻¹ (q + Wᵀ f) = z + K⁻¹ Wᵀ (f - (I + A C)⁻¹ A (W z + C f)), with
+    C = W K⁻¹ Wᵀ.
 
     ``influence`` (slots, 3, n, 3) holds the columns K⁻¹ Wᵀ, zero outside the rows ``slot_range`` (slots, 2);
     ``compliance`` is C over all slots. Overwrites ``point``, ``answer`` (u, 3), ``system`` (3 u, 3 u).
     """
     u = len(slots)
     at_points(z, nodes, weights, point)
+    for i in range(3 * u):
+        for k in range(3 * u):
+            point[i // 3, i % 3] += compliance[3 * slots[i // 3] + i % 3, 3 * slots[k // 3] + k % 3] * f[k // 3, k % 3]
     multiply(matrix, point, answer)
     for i in range(3 * u):
         for j in range(3 * u):
@@ -167,7 +197,7 @@ def hold_base(
     for i in range(u):
         lo, hi = slot_range[slots[i], 0], slot_range[slots[i], 1]
         for r in range(3):
-            add_scaled(-answer[i, r], influence[slots[i], r], z, lo, hi)
+            add_scaled(f[i, r] - answer[i, r], influence[slots[i], r], z, lo, hi)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
