@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trainer.geometry import Array, Rigid, quaternion_from_axis_angle, quaternion_multiply
+from trainer.geometry import Array, Rigid
 
 #: Length of a blade from its axis to its tip, mm.
 BLADE_MM = 12.0
@@ -56,14 +56,13 @@ def parts() -> tuple[Blade, Blade]:
 
 def part_poses(world_from_tool: Rigid, closure: float) -> tuple[Array, Array]:
     """Where the blades are: positions (2, 3) mm and quaternions (2, 4) wxyz, world_from_blade."""
-    angle = _blade_angle(closure)
-    root = world_from_tool.apply(np.array([-BLADE_MM, 0.0, 0.0]))
-    z = np.array([0.0, 0.0, 1.0])
-    quaternions = [
-        quaternion_multiply(world_from_tool.quaternion, quaternion_from_axis_angle(z, side * angle))
+    half = 0.5 * _blade_angle(closure)
+    axis = np.array([-BLADE_MM, 0.0, 0.0])
+    blades = [
+        world_from_tool @ Rigid(axis, np.array([math.cos(half), 0.0, 0.0, side * math.sin(half)]))
         for side in (1.0, -1.0)
     ]
-    return np.stack([root, root]), np.stack(quaternions)
+    return np.array([b.position for b in blades]), np.array([b.quaternion for b in blades])
 
 
 def jaw_gap_mm(closure: float) -> float:
