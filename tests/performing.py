@@ -10,6 +10,7 @@ from trainer import scene
 from trainer.curriculum import Task, load_task
 from trainer.drivers.scripted import ScriptedHands
 from trainer.events import Event, Pierce, TaskDone
+from trainer.interactions.holding import TOLERANCE_MN
 from trainer.log.record import SessionHeader, SessionRecord
 from trainer.poses import ToolPoses
 from trainer.profile import Hand
@@ -31,9 +32,9 @@ class Performance:
         return [e for e in self.events if isinstance(e, Pierce) and (e.body, e.wall) == (vessel, wall)]
 
 
-def perform(task: Task, hand: Hand, seed: int = 0) -> Performance:
+def perform(task: Task, hand: Hand, seed: int = 0, tolerance_mN: float = TOLERANCE_MN) -> Performance:
     """Let a scripted hand go through a task; every state on the way must be finite."""
-    s = scene.build(task)
+    s = scene.build(task, tolerance_mN)
     hands = ScriptedHands(hand, task, s.home, seed)
     events: list[Event] = []
     poses: list[ToolPoses] = []

@@ -91,6 +91,8 @@ WRONG: list[tuple[str, str, str]] = [
     ("value = 500.0", "value = 1e300", r"'scene\.vessel\[0\]\.modulus_kPa' must be >= 1e-06 and <= 1e\+09"),
     ("value = 1.0", "value = 1e300", r"'scene\.vessel\[0\]\.puncture_outer_mN' must be > 0 and <= 1e\+06"),
     ("home_mm = [-1.5,", "home_mm = [1e300,", r"'scene\.instrument\[0\]\.home_mm\[0\]' must be >= -100000 and <="),
+    ("node_error_mm = 0.003", "node_error_mm = 0", r"'solver\.node_error_mm' must be > 0 and <= 1000, found 0"),
+    ("node_error_mm", "node_error_um", r"\[solver\]: unknown key 'node_error_um', did you mean 'node_error_mm'"),
     ("axis = [-1.0, 0.0, 0.0]", "axis = [-1e-200, 0.0, 0.0]", r"'axis' must not be the zero vector"),
     ('kind = "forceps"', 'kind = "forceps"\nopen_at = 0.8', r"'open_at' must be less than 'close_at'"),
 ]
@@ -114,6 +116,12 @@ def test_a_component_that_is_not_named_is_none() -> None:
     text = curriculum.load_task("anastomosis/single-stitch").text
     begin, end = text.index("[scene.thread]"), text.index("[[scene.instrument]]")
     assert curriculum.parse_task(text[:begin] + text[end:], "t.toml").scene.thread is None
+
+
+def test_a_task_without_a_solver_has_the_default_budget() -> None:
+    text = curriculum.load_task("anastomosis/single-stitch").text
+    begin, end = text.index("[solver]"), text.index("[limits]")
+    assert curriculum.parse_task(text[:begin] + text[end:], "t.toml").solver == curriculum.SolverSpec(0.003)
 
 
 def write_family(folder: Path) -> None:

@@ -134,6 +134,21 @@ class SceneSpec:
 
 
 @dataclass(frozen=True)
+class SolverSpec:
+    """How exact the simulation must be; the cheapest method that was measured to be so is taken (trainer.choice).
+
+    A task without this table, or without a key of it, gets the default. Both are assumed: a hundredth of what a
+    trainee sees, far below a tracker's noise; a hundredth of what the outer wall of a 1 mm vessel bears. What gives
+    way is judged by forces: with 0.1 mN left over, nodes are within 0.003 mm, but one needle pierced 0.04 mm off.
+    """
+
+    #: Tolerated distance of a tissue's node from where it would come to rest.
+    node_error_mm: float = field(default=0.003, metadata={"bounds": Bounds(0.0, 1000.0, low_open=True)})
+    #: Tolerated unbalanced force, the Euclidean norm over all free nodes.
+    force_error_mN: float = field(default=0.01, metadata=FORCE_MN)
+
+
+@dataclass(frozen=True)
 class Step:
     """One step of the goal; steps are reached in order.
 
@@ -183,6 +198,7 @@ class Task:
     step: tuple[Step, ...]
     metric: tuple[MetricTarget, ...]
     limits: dict[str, Limit] = field(default_factory=dict)
+    solver: SolverSpec = SolverSpec()
     tick_hz: float = field(default=100.0, metadata={"bounds": Bounds(20.0, 2000.0)})
 
     def __post_init__(self) -> None:

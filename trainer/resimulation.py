@@ -11,17 +11,20 @@ from itertools import zip_longest
 
 from trainer import curriculum, scene
 from trainer.events import Event, TaskDone, payload
-from trainer.log.record import SessionRecord
+from trainer.log.record import TOLERANCE, SessionRecord
 from trainer.poses import ToolPoses
 
 
 def resimulate(record: SessionRecord, rows: Iterable[int] | None = None) -> list[Event]:
     """The events of the stored tool poses, stepped through a fresh scene of the stored task.
 
+    The tissue is solved to the stored tolerance; sessions older than the choice of one have that of ``build``.
     ``rows`` are the indices of the stored ticks; a progress bar may wrap them. Raises ConfigError when the
     stored task no longer fits this version of the program.
     """
-    running = scene.build(curriculum.parse_task(record.header.task_toml, record.header.task))
+    header = record.header
+    chosen = {"tolerance_mN": float(header.versions[TOLERANCE])} if TOLERANCE in header.versions else {}
+    running = scene.build(curriculum.parse_task(header.task_toml, header.task), **chosen)
     found: list[Event] = []
     for i in range(record.ticks) if rows is None else rows:
         found += running.step(

@@ -1,7 +1,7 @@
 """A scene: the components that a task asks for, and one step of all of them.
 
 ``build`` makes it from a task, ``step`` moves it by one tick under given instrument poses and tells what
-happened. A step is a function of task, state and poses alone: it reads no clock and draws no random number.
+happened. A step is a function of task, tolerance, state and poses alone: it reads no clock and draws no random number.
 """
 
 from __future__ import annotations
@@ -30,8 +30,11 @@ STRIDE_MM = 0.1
 MOST_MOVEMENTS = 16
 
 
-def build(task: Task) -> Scene:
-    """The scene at rest, with the instruments at home and the needle where the task has it held."""
+def build(task: Task, tolerance_mN: float = holding.TOLERANCE_MN) -> Scene:
+    """The scene at rest, with the instruments at home and the needle where the task has it held.
+
+    ``tolerance_mN`` is the unbalanced force at which the tissue counts as in equilibrium.
+    """
     spec = task.scene
     world_from_scene = Rigid(np.array(spec.position_mm), quaternion_from_euler_deg(spec.rotation_deg))
     homes = [Rigid(np.array(i.home_mm), quaternion_from_euler_deg(i.home_rotation_deg)) for i in spec.instrument]
@@ -61,7 +64,7 @@ def build(task: Task) -> Scene:
         back = -world.needle_pose.rotate(needle_tangent(world.needle, world.needle.length))
         along = spec.thread.link_mm * np.arange(count)
         world.nodes = thread_pull.swage(world) + along[:, None] * back
-    return Scene(world)
+    return Scene(world, tolerance_mN)
 
 
 def _hand_over_needle(world: World) -> None:
@@ -87,8 +90,9 @@ def _hand_over_needle(world: World) -> None:
 class Scene:
     """State of one exercise; see :mod:`trainer.interactions.world` for what is in it."""
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: World, tolerance_mN: float) -> None:
         self.world = world
+        self.tolerance_mN = tolerance_mN
         self.tools = world.tools
         self.outcome = ""  # completed, failed, aborted or timeout; empty while it runs
         self.reason = ""
@@ -174,7 +178,7 @@ class Scene:
         if world.needle is not None and tool:
             pierce.detect(world, before, world.needle_pose, start_s, span_s, tool)
             pierce.glide(world)
-        holding.equilibrate(world, before, start_s, span_s, tool)
+        holding.equilibrate(world, before, start_s, span_s, tool, self.tolerance_mN)
         pierce.follow_needle(world, end_s, tool)
         giving_way.relieve(world, end_s)
         thread_pull.settle(world, end_s)

@@ -21,6 +21,7 @@ import pytest
 from numba.core.dispatcher import Dispatcher
 
 from trainer import curriculum
+from trainer.choice import choose_tissue
 from trainer.cli.scores import suggestion
 from trainer.cli.warmup import warm_up
 from trainer.clock import Fast
@@ -71,6 +72,11 @@ def test_the_document_says_all_that_the_contract_asks(command_line: CommandLine,
     assert set(found["realtime"]) == {"tick_hz", "overruns", "p50_ms", "p99_ms", "max_ms"}
     assert 0.0 < found["realtime"]["p50_ms"] <= found["realtime"]["p99_ms"] <= found["realtime"]["max_ms"]
     assert found["device"]["name"] == "scripted-expert"
+    assert set(found["methods"]) == {"tissue", "thread"}
+    tissue = found["methods"]["tissue"]
+    assert tissue == asdict(choose_tissue(curriculum.load_task(str(task)).task, str(task)))
+    assert tissue["measured_error_mm"] <= tissue["budget"]["node_error_mm"] == 0.003
+    assert (found["methods"]["thread"]["method"], found["methods"]["thread"]["links"]) == ("follow the leader", 100)
     recording = db.parent / "recordings" / f"{found['session']}.rrd"
     assert found["recording"] == str(recording)
     assert recording.stat().st_size > 0
@@ -95,7 +101,8 @@ def test_what_is_printed_is_what_the_log_holds(command_line: CommandLine, task: 
     assert stored.header.task_toml == task_file.text
     assert stored.header.seed == 3
     assert stored.header.tools == ("left", "right")
-    assert set(stored.header.versions) == {"trainer", "python", "numpy", "scipy", "numba", "machine"}
+    assert set(stored.header.versions) == {"trainer", "python", "numpy", "scipy", "numba", "machine", "tolerance_mN"}
+    assert float(stored.header.versions["tolerance_mN"]) == found["methods"]["tissue"]["tolerance_mN"]
     assert found["recording"] is stored.header.recording is None
 
 
@@ -119,6 +126,8 @@ def test_a_person_reads_a_table_and_where_things_are(command_line: CommandLine, 
         "timeout after 0.3 s",
         "Entry angle",
         "70 to 90°",
+        "methods        tissue by kept factor to ",
+        "thread by follow the leader",
         str(db),
         str(rrd),
         f"next           {task} again",
@@ -149,6 +158,10 @@ REFUSED = [
     (["anastomosis/single-stitch", "--device", "no.toml"], "no.toml: no such file"),
     (["anastomosis/single-stitch", "--device", "no.mha"], "no.mha: no such file"),
     (["wrong.toml"], "wrong.toml: [scene.vessel[0]]: unknown key 'wall_um', did you mean 'wall_mm'?"),
+    (
+        ["exact.toml"],
+        "exact.toml: nothing that a scene can run on was measured to keep 'solver.node_error_mm' = 1e-12",
+    ),
     (["metric.toml"], "no metric 'entry_angle_rad', did you mean 'entry_angle_deg'?"),
     (["anastomosis/single-stitch", "--db", "folder"], "folder: "),
     (["anastomosis/single-stitch", "--db", "text.db"], "text.db: not a log"),
@@ -169,6 +182,7 @@ def test_what_cannot_be_used_is_refused_in_one_line(
     monkeypatch.chdir(tmp_path)
     text = curriculum.load_task("anastomosis/single-stitch").text
     Path("wrong.toml").write_text(text.replace("wall_mm = 0.15", "wall_um = 150.0"))
+    Path("exact.toml").write_text(text.replace("node_error_mm = 0.003", "node_error_mm = 1e-12"))
     Path("metric.toml").write_text(text.replace('"entry_angle_deg"', '"entry_angle_rad"'))
     Path("folder").mkdir()
     Path("text.db").write_text("this is no log, only some text")

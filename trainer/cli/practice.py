@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
+    from trainer.choice import Choice
     from trainer.clock import Fast
     from trainer.curriculum import TaskFile
     from trainer.log.record import SessionHeader
@@ -82,6 +83,7 @@ def perform(
     Whatever can be refused is refused before the session enters the log. Raises ConfigError for a task or
     device that cannot be used, LogError and RecordingError where they cannot be written.
     """
+    from trainer.choice import choose_tissue, thread_method
     from trainer.cli.progress import Progress
     from trainer.cli.warmup import announce, warm_up
     from trainer.drivers import open_driver
@@ -94,16 +96,17 @@ def perform(
 
     task = task_file.task
     check_targets(task)
+    tissue = choose_tissue(task, task_file.path)
     if recording_path is not None:
         _make_room(recording_path)
     _close_interrupted(log_path)
     announce()
-    scene = build(task)
+    scene = build(task) if tissue is None else build(task, tissue.tolerance_mN)
     profile, driver = open_driver(device, task, scene.home, seed)
     stack.enter_context(closing(driver))
     if clock.realtime:
         warm_up(task)
-    header = _header(session_id, trainee, task_file, profile, seed, scene.tools, recording_path)
+    header = _header(session_id, trainee, task_file, profile, seed, scene.tools, recording_path, tissue)
     sinks: list[Sink] = []
     recording = None
     if recording_path is not None:
@@ -131,6 +134,10 @@ def perform(
         "metrics": [asdict(metric) for metric in metrics],
         "recording": None if recording_path is None else str(recording_path),
         "log": str(log_path),
+        "methods": {
+            "tissue": None if tissue is None else asdict(tissue),
+            "thread": thread_method(task.scene.thread),
+        },
         "realtime": pace,
         "device": {"name": device, "seed": seed, **seen},
     }
@@ -144,10 +151,11 @@ def _header(
     seed: int,
     tools: tuple[str, ...],
     recording: Path | None,
+    tissue: Choice | None,
 ) -> SessionHeader:
     from datetime import UTC, datetime
 
-    from trainer.log.record import SessionHeader
+    from trainer.log.record import TOLERANCE, SessionHeader
 
     return SessionHeader(
         id=session_id,
@@ -162,7 +170,8 @@ def _header(
         tick_hz=task_file.task.tick_hz,
         tools=tools,
         started_at=datetime.now(UTC).isoformat(timespec="milliseconds"),
-        versions=versions(),
+        # A float's text holds all its bits.
+        versions=versions() | ({} if tissue is None else {TOLERANCE: repr(tissue.tolerance_mN)}),
         recording=None if recording is None else str(recording),
     )
 

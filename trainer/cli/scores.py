@@ -37,10 +37,24 @@ def print_result(result: dict[str, Any], task: Task) -> None:
     )
     console.print(table)
     console.print(f"work per tick  median {pace['p50_ms']:.2f} ms, 99 % within {pace['p99_ms']:.2f} ms")
+    console.print(f"methods        {_methods(result['methods'])}")
     console.print(f"session        {result['session']} in {result['log']}")
     if result["recording"] is not None:
         console.print(f"recording      {result['recording']}")
     console.print(f"next           {suggestion(result['task'], result['outcome'], rows)}")
+
+
+def _methods(methods: dict[str, Any]) -> str:
+    """What moved the tissue and the thread, in a line."""
+    tissue, thread = methods["tissue"], methods["thread"]
+    said = []
+    if tissue is not None:
+        said.append(f"tissue by {tissue['method']} to {tissue['tolerance_mN']:.2g} mN")
+        if tissue["cheapest"]["method"] != tissue["method"]:
+            said[0] += f" ({tissue['cheapest']['method']} would be cheaper, but cannot run in a scene)"
+    if thread is not None:
+        said.append(f"thread by {thread['method']}")
+    return "; ".join(said) or "none"
 
 
 def suggestion(reference: str, outcome: str, rows: list[MetricRow]) -> str:

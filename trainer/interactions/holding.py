@@ -18,8 +18,9 @@ from trainer.mechanics.attachments import Anchors, Loads
 #: Stiffness of what holds the tissue, in units of modulus times wall thickness: a hundred times the wall's own,
 #: so that a held point is off its place by a hundredth of the dent that the force makes.
 HOLD = 100.0
-#: Unbalanced force at which the tissue counts as in equilibrium, mN: a hundredth of a puncture force. In a stitch this
-#: leaves nodes 0.1 µm (median; 2.4 µm at most in 99 of 100) from where they would come to rest, and forces 0.01 mN.
+#: Unbalanced force at which the tissue counts as in equilibrium, mN, where nobody chose another: a hundredth of a
+#: puncture force. In a stitch this leaves nodes 0.1 µm (median; 2.4 µm at most in 99 of 100) from where they would
+#: come to rest, and forces 0.01 mN. Stored sessions that name no tolerance were made with it: leave it as it is.
 TOLERANCE_MN = 1e-2
 #: Iterations of one solve; the next movement goes on where it stopped.
 MOST_ITERATIONS = 8
@@ -73,7 +74,7 @@ def drag(world: World) -> Loads:
     return Loads(np.array(slot, dtype=np.int64), np.array(force).reshape(-1, 3)) if slot else Loads.none()
 
 
-def equilibrate(world: World, before: Rigid, start_s: float, span_s: float, tool: str) -> None:
+def equilibrate(world: World, before: Rigid, start_s: float, span_s: float, tool: str, tolerance_mN: float) -> None:
     """Bring the tissue to equilibrium with all that holds it, then judge what gives way."""
     if world.tissue is None or world.solver is None:
         return
@@ -85,7 +86,7 @@ def equilibrate(world: World, before: Rigid, start_s: float, span_s: float, tool
         held.anchors,
         tuple(c for _, _, c in taut),
         drag(world),
-        tolerance_mN=TOLERANCE_MN,
+        tolerance_mN=tolerance_mN,
         max_iterations=MOST_ITERATIONS,
     )
     tip = next((found.anchor_force[r] for r, who in enumerate(held.owner) if who is None), None)

@@ -9,6 +9,10 @@ import numpy as np
 from trainer.events import Event
 from trainer.geometry import Array
 
+#: The key of ``SessionHeader.versions`` that holds the force, mN, at which the tissue counted as in equilibrium. It was
+#: chosen by measurements that may change, so a replay takes it from here.
+TOLERANCE = "tolerance_mN"
+
 
 @dataclass(frozen=True)
 class SessionHeader:
@@ -26,7 +30,7 @@ class SessionHeader:
     tick_hz: float
     tools: tuple[str, ...]
     started_at: str  # UTC, ISO 8601
-    versions: dict[str, str]  # trainer, python, numpy, numba, machine
+    versions: dict[str, str]  # trainer, python, numpy, numba, machine; TOLERANCE where the scene has tissue
     recording: str | None  # path of the .rrd
 
 
