@@ -47,7 +47,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "metrics": DATA | {"log"},
     "reporting": DATA | {"log", "metrics"},
     "exports": DATA | {"log", "metrics"},
-    "bench": {"clock", "config", "curriculum", "geometry", "mechanics", "anatomy", "reporting"},
+    "bench": DATA
+    | {"anatomy", "clock", "drivers", "interactions", "mechanics", "profile", "reporting", "scene", "session"},
 }
 #: Too heavy to be imported before a command knows that it needs them.
 HEAVY = {"numba", "numpy", "scipy", "rerun", "trimesh", "sqlite_utils", "rich"}

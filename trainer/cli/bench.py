@@ -108,6 +108,38 @@ def speed_error(
         typer.echo(f"written: {path}", err=True)
 
 
+@app.command()
+def stability(
+    quick: Annotated[bool, typer.Option("--quick", help="Below a minute: without the cases that take long.")] = False,
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Where the report goes; by default reports/ if it is here.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """What becomes of hard cases; writes stability.md. Exit code 1 when a law is broken."""
+    from trainer.bench import stability as hard
+    from trainer.bench.machine import load
+    from trainer.cli.sessions import print_table
+    from trainer.cli.warmup import announce
+
+    folder = out or (Path("reports") if Path("reports").is_dir() else Path())
+    announce()
+    about = _machine()
+    outcomes = hard.measure(quick)
+    about["load_after"] = load()
+    written = hard.write(folder, outcomes, about, quick)
+    if as_json:
+        print(json.dumps(hard.document(outcomes, about, quick), indent=2, allow_nan=False))
+    else:
+        for of_subject in outcomes.values():
+            rows = [(o.case, o.method, o.outcome, f"{o.seconds:.2f}") for o in of_subject]
+            print_table(("case", "method", "outcome", "s"), rows)
+        print(hard.in_numbers(outcomes))
+    typer.echo(f"written: {written}", err=True)
+    if hard.counts(outcomes)["BROKEN"]:
+        raise typer.Exit(1)
+
+
 def _machine() -> dict[str, Any]:
     from trainer.bench.machine import machine
     from trainer.cli.practice import versions
