@@ -1,4 +1,4 @@
-"""The bare chain against closed forms, other unknowns and conservation laws; what it refuses; that it repeats itself."""
+"""The bare chain against closed forms, other unknowns and conservation laws; what it refuses; that it repeats."""
 
 from __future__ import annotations
 
@@ -194,19 +194,23 @@ def test_what_the_holds_bear_is_what_momentum_asks_for() -> None:
 
 
 def test_ends_drawn_apart_are_refused_at_the_limit_and_leave_the_chain_alone() -> None:
-    """The pull grows without a leap as 1 mm/s draws the chain straight; at the limit one line says so."""
+    """The pull grows without a leap as 10 mm/s draw the chain straight; at the limit one line says so."""
     model = chain(50)
     x = hanging(model, 50)
     held = holds(model, [0, 50], x[[0, 50]], 50.0)
     state = begin_chain(model, x)
-    furthest = 0.0
-    with pytest.raises(ChainTaut, match=r"mN: 50 can be held"):
-        for k in range(3000):
-            before = state.x.copy()
-            held.target[1, 0] = x[50, 0] + 0.1 * k
+    furthest, refusal = 0.0, ""
+    while not refusal:
+        before = state.x.copy()
+        held.target[1, 0] += 0.1
+        try:
             step_chain(model, state, held, 0.01)
-            furthest = max(furthest, float(np.max(np.abs(state.x - before))))
+        except ChainTaut as error:
+            refusal = str(error)
+        else:
             assert np.linalg.norm(held.bears, axis=1).max() <= 50.0
+        furthest = max(furthest, float(np.max(np.abs(state.x - before))))
+    assert refusal.endswith("mN, of which 50 can be held")
     assert np.array_equal(before, state.x)
     assert held.target[1, 0] < model.length
     assert furthest <= 20.0
@@ -235,7 +239,7 @@ def test_what_is_no_chain_is_refused() -> None:
     with pytest.raises(ValueError, match="shape"):
         begin_chain(model, np.zeros((3, 3)))
     state = begin_chain(model, straight(model))
-    with pytest.raises(ValueError, match="two neighbours"):
+    with pytest.raises(ValueError, match="neighbours"):
         step_chain(model, state, holds(model, [3, 4], straight(model)[3:5]), 0.01)
     for tick, tolerance in ((0.0, 1.0), (math.nan, 1.0), (0.01, 0.0), (0.01, math.inf)):
         with pytest.raises(ValueError, match="cannot"):

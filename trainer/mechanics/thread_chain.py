@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -94,15 +95,15 @@ def begin_chain(model: RodModel, x: ArrayLike, v: ArrayLike | None = None) -> Ch
     )  # fmt: skip
 
 
-def _out_of_reach(model: RodModel, held: Holds) -> str:
-    """What is wrong with where the holds are to be, or nothing."""
-    order = sorted(range(len(held.node)), key=lambda k: int(held.node[k]))
-    for a, b in zip(order, order[1:], strict=False):
-        reach = (int(held.node[b]) - int(held.node[a])) * model.link
-        apart = math.dist(held.target[a].tolist(), held.target[b].tolist())
+def _check_reach(model: RodModel, held: Holds) -> None:
+    """Refuse holds between which a rigid chain cannot be."""
+    at = dict(zip(held.node.tolist(), held.target.tolist(), strict=True))
+    for a, b in pairwise(sorted(at)):
+        if b == a + 1:
+            raise ValueError(f"nodes {a} and {b} are neighbours: a rigid link between two holds bears anything")
+        reach, apart = (b - a) * model.link, math.dist(at[a], at[b])
         if apart >= reach:
-            return f"nodes {held.node[a]} and {held.node[b]} cannot be {apart:.6g} mm apart: {reach:.6g} mm of thread"
-    return ""
+            raise ChainTaut(f"nodes {a} and {b} cannot be {apart:.6g} mm apart on {reach:.6g} mm of thread")
 
 
 def step_chain(model: RodModel, state: ChainState, held: Holds, tick: float, tolerance: float | None = None) -> None:
@@ -121,12 +122,7 @@ def step_chain(model: RodModel, state: ChainState, held: Holds, tick: float, tol
     if not all(map(math.isfinite, held.target.ravel().tolist())):
         raise ValueError("a hold's target is not finite")
     if len(held.node) > 1:
-        nodes = sorted(held.node.tolist())
-        if any(b == a + 1 for a, b in zip(nodes, nodes[1:], strict=False)):
-            raise ValueError("two neighbours are held: a rigid link between two holds bears anything")
-        wrong = _out_of_reach(model, held)
-        if wrong:
-            raise ChainTaut(wrong)
+        _check_reach(model, held)
     advance_chain(
         method(), state._work, state.x, state.v, state.tension, state._mass, model.drag / model.mass, state._gravity,
         model.link, held.node, held.target, held.limit, held.bears, state._holds[0], state._holds[1], state._secant,
@@ -134,9 +130,8 @@ def step_chain(model: RodModel, state: ChainState, held: Holds, tick: float, tol
     )  # fmt: skip
     if state.outcome[0] == TAUT:
         k = int(state.outcome[4])
-        raise ChainTaut(
-            f"node {held.node[k]} would pull with {state.outcome[5]:.3g} mN: {held.limit[k]:.3g} can be held"
-        )
+        force, limit = state.outcome[5], held.limit[k]
+        raise ChainTaut(f"node {held.node[k]} would pull with {force:.3g} mN, of which {limit:.3g} can be held")
     if state.outcome[0] != DONE:
         raise ChainStalled("no substep of the chain was short enough: it is taut, or moves faster than can be followed")
     state._clock[0] = tick
