@@ -191,18 +191,21 @@ def test_a_task_in_real_time(command_line: CommandLine, own_log: Path) -> None:
     assert not own_log.exists()
 
 
-@pytest.mark.parametrize("reports", [True, False])
-def test_speed_error_writes_where_reports_are(
-    reports: bool, command_line: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("reports", "quick"), [(True, True), (True, False), (False, False)])
+def test_speed_error_writes_where_reports_are_and_a_short_run_replaces_no_whole_one(
+    reports: bool, quick: bool, command_line: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     if reports:
         (tmp_path / "reports").mkdir()
     monkeypatch.setattr(page, "measure", lambda quick: rows())
-    code, out, err = command_line("bench", "speed-error", "--quick", "--json")
+    code, out, err = command_line("bench", "speed-error", *(["--quick"] if quick else []), "--json")
     assert code == 0
-    assert json.loads(out)["quick"] is True
-    assert (tmp_path / "reports" / "speed_error.md" if reports else tmp_path / "speed_error.md").exists()
+    assert json.loads(out)["quick"] is quick
+    folder = (tmp_path / "reports" if reports else tmp_path) / ("quick" if quick else "")
+    assert [p.relative_to(tmp_path) for p in tmp_path.rglob("speed_error.md")] == [
+        (folder / "speed_error.md").relative_to(tmp_path)
+    ]
     assert "speed_error.md" in err
 
 

@@ -14,6 +14,11 @@ from trainer.cli.sessions import JsonOption
 if TYPE_CHECKING:
     from trainer.clock import Realtime
 
+OutOption = Annotated[
+    Path | None,
+    typer.Option(metavar="DIR", help="Where the report goes; by default reports/, or reports/quick/ if --quick."),
+]
+
 app = typer.Typer(help="Measure the program on this machine; without a command a short run of all.")
 
 
@@ -75,9 +80,7 @@ def realtime(
 @app.command("speed-error")
 def speed_error(
     quick: Annotated[bool, typer.Option("--quick", help="About a minute: small meshes, few repetitions.")] = False,
-    out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Where the report goes; by default reports/ if it is here.")
-    ] = None,
+    out: OutOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Time against error of every method of mechanics; writes speed_error.md, .svg and .json."""
@@ -86,7 +89,7 @@ def speed_error(
     from trainer.cli.sessions import print_table
     from trainer.cli.warmup import announce
 
-    folder = out or (Path("reports") if Path("reports").is_dir() else Path())
+    folder = _folder(out, quick)
     announce()
     about = _machine()
     rows = page.measure(quick)
@@ -110,10 +113,10 @@ def speed_error(
 
 @app.command()
 def stability(
-    quick: Annotated[bool, typer.Option("--quick", help="Below a minute: without the cases that take long.")] = False,
-    out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Where the report goes; by default reports/ if it is here.")
-    ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Within a minute once kernels are compiled: not the long cases.")
+    ] = False,
+    out: OutOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """What becomes of hard cases; writes stability.md. Exit code 1 when a law is broken."""
@@ -122,7 +125,7 @@ def stability(
     from trainer.cli.sessions import print_table
     from trainer.cli.warmup import announce
 
-    folder = out or (Path("reports") if Path("reports").is_dir() else Path())
+    folder = _folder(out, quick)
     announce()
     about = _machine()
     outcomes = hard.measure(quick)
@@ -138,6 +141,14 @@ def stability(
     typer.echo(f"written: {written}", err=True)
     if hard.counts(outcomes)["BROKEN"]:
         raise typer.Exit(1)
+
+
+def _folder(out: Path | None, quick: bool) -> Path:
+    """Where a report goes: a short run does not replace the whole one, by which methods are chosen."""
+    if out is not None:
+        return out
+    here = Path("reports") if Path("reports").is_dir() else Path()
+    return here / "quick" if quick else here
 
 
 def _machine() -> dict[str, Any]:
