@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import json
 import tracemalloc
+from collections.abc import Callable
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -295,3 +296,15 @@ def test_a_scene_without_tissue_allocates_none() -> None:
     assert whole.solver is not None
     assert held_bytes(whole, set()) > 10 * whole.solver.x.nbytes
     assert peak_bytes(one_drive()) - peak_bytes(task) > 10 * whole.solver.x.nbytes
+
+
+def test_checking_a_task_finds_a_budget_that_nothing_meets(
+    command_line: Callable[..., tuple[int, str, str]], tmp_path: Path
+) -> None:
+    text = load_task("anastomosis/needle-drive").text
+    path = tmp_path / "needle-drive.toml"
+    path.write_text(text.replace("node_error_mm = 0.003", "node_error_mm = 1e-12"), encoding="utf-8")
+    code, _, err = command_line("curricula", "check", str(path))
+    assert code == 1
+    assert "node_error_mm" in err
+    assert len(err.splitlines()) == 1

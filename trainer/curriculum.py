@@ -258,7 +258,7 @@ def load_family(name: str) -> Family:
 def check(path: Path, check_task: Callable[[Task], None]) -> list[str]:
     """What is wrong with a task file, a family file or a folder of them; empty when nothing is.
 
-    ``check_task`` raises ConfigError for a task that cannot be scored (``trainer.metrics.registry.check_targets``).
+    ``check_task`` raises ConfigError for a task that cannot be scored or simulated as it asks.
     """
     if path.is_dir():
         files = sorted(path.rglob("*.toml"))

@@ -58,9 +58,14 @@ def check(
 ) -> None:
     """Check files of a curriculum; exit code 1 when something is wrong."""
     from trainer import curriculum
+    from trainer.choice import choose_tissue
     from trainer.metrics.registry import check_targets
 
-    problems = curriculum.check(path, check_targets)
+    def check_task(task: curriculum.Task) -> None:
+        check_targets(task)
+        choose_tissue(task, task.name)
+
+    problems = curriculum.check(path, check_task)
     if as_json:
         print(json.dumps({"path": str(path), "problems": problems}, indent=2))
     elif problems:
@@ -109,6 +114,8 @@ def _print_task(reference: str, task: Task) -> None:
     print("\nLimits")
     for name, limit in task.limits.items():
         print(f"  {name}: {limit.value:g} {limit.unit}  [{limit.source}]")
+    budget = task.solver
+    print(f"\nTissue\n  right to {budget.node_error_mm:g} mm and {budget.force_error_mN:g} mN of unbalanced force")
     print("\nMeasured")
     for metric in task.metric:
         target = wording.band(metric.low, metric.high, definition_of(metric.name, task).unit) or "no target"
