@@ -53,11 +53,13 @@ def test_the_reference_agrees_with_one_in_other_unknowns(monkeypatch: pytest.Mon
 
 
 def test_rows_say_what_was_measured(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every case, method and setting has a row; the rod keeps lengths to 1e-6 and the suture's place to 1 %."""
+    """Every case, method and setting has a row; the rod keeps lengths to 1e-6 and the suture's place to 1 %;
+
+    the chain lengths to 1e-9 and, with 1e-5 a substep, in 0.1 s its place to 1e-4."""
     monkeypatch.setattr(thread, "SECONDS", 0.1)
     rows = thread.measure(True, (50,))
     assert {r.case for r in rows} == {"swing, suture", "swing, bare", "drag, suture", "drag, bare"}
-    assert {r.method for r in rows} == {"rod", "xpbd", "follow-the-leader"}
+    assert {r.method for r in rows} == {"rod", "chain", "xpbd", "follow-the-leader"}
     assert len({(r.case, r.size, r.method, r.setting) for r in rows}) == len(rows)
     for row in rows:
         assert row.frames == 10
@@ -66,13 +68,22 @@ def test_rows_say_what_was_measured(monkeypatch: pytest.MonkeyPatch) -> None:
             assert row.residual <= 1e-6
             assert math.isfinite(row.error)
             assert "bare" in row.case or row.error <= 1e-2
+        if row.method == "chain":
+            assert row.residual <= 1e-9
+            assert row.error <= 1e-4
 
 
-def test_a_peer_that_is_missing_is_said_to_be(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "mujoco", None)
-    (row,) = peers.measure()
-    assert "not installed" in row.status
-    assert row.frames == 0
+def test_peers_that_are_missing_are_said_to_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(thread, "SECONDS", 0.1)
+    for name in ("mujoco", "elastica"):
+        monkeypatch.setitem(sys.modules, name, None)
+    rows = peers.measure(10)
+    missing = [r for r in rows if r.frames == 0]
+    assert [r.status for r in missing] == [
+        "not measured: mujoco is not installed",
+        "not measured: elastica is not installed",
+    ]
+    assert {r.method for r in rows if r.frames} == {"rod", "chain"}
 
 
 @pytest.mark.parametrize(("case", "method", "run"), cases(), ids=lambda value: value if isinstance(value, str) else "")

@@ -65,7 +65,7 @@ def test_energy_is_kept_with_the_order_of_the_method() -> None:
         before, worst = energy(model, state), 0.0
         for _ in range(round(0.16 / tick)):
             step_chain(model, state, held, tick, 1e3)
-            assert state.outcome[1] == 1.0
+            assert state.numbers[1] == 1.0
             worst = max(worst, abs(energy(model, state) - before))
         lost.append(worst)
     assert lost[1] > 1e-13 * model.mass * model.length**2 * G, "an error that is all rounding has no order"

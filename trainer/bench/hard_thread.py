@@ -7,12 +7,14 @@ from collections.abc import Callable
 
 import numpy as np
 
-from trainer.bench.thread import straight, suture
+from trainer.bench.thread import bare, forceps, straight, suture
+from trainer.geometry import Array
+from trainer.mechanics.thread_chain import ChainTaut, begin_chain, step_chain
 from trainer.mechanics.thread_contact import clear, touch_itself, touch_triangles
 from trainer.mechanics.thread_rod import RodModel, RodState, begin, holds, no_contacts, settle, step
 
 TICK_S = 0.01
-METHOD = "rod"
+METHOD, CHAIN = "rod", "chain"
 
 
 def _stretch(model: RodModel, state: RodState) -> float:
@@ -160,6 +162,56 @@ def bad_starts() -> str:
     return f"ok: a point and a fold are drawn to 60 mm, lengths to {worst:.0e}"
 
 
+def chain_over_taut() -> str:
+    """A rigid chain's ends drawn apart: the pull grows to the hold's limit, where a tick is refused."""
+    model, refusal = bare(200), ""
+    half = np.arange(model.count)
+    x = model.link * np.stack([0.6 * half, 0.0 * half, -0.8 * np.minimum(half, 200 - half)], axis=1)
+    state = begin_chain(model, x)
+    held = holds(model, [0, 200], x[[0, 200]], 150.0)
+    furthest = 0.0
+    while not refusal:
+        held.target[1, 0] += 2.0
+        before = state.x.copy()
+        try:
+            step_chain(model, state, held, TICK_S)
+        except ChainTaut as error:
+            refusal = str(error)
+        furthest = max(furthest, float(np.max(np.abs(state.x - before))))
+        _level(state.x, model.link)
+    assert np.array_equal(before, state.x), "a refused tick moved the chain"
+    assert held.target[1, 0] <= model.length + 2.0
+    return f"refused: {refusal}; no node had moved more than {furthest:.0f} mm a tick"
+
+
+def _level(x: Array, link: float) -> float:
+    """The largest relative error of a rigid link's length."""
+    error = float(np.max(np.abs(np.linalg.norm(np.diff(x, axis=0), axis=1) / link - 1.0)))
+    assert error <= 1e-9, f"a link's length is off by {error:.1e}"
+    return error
+
+
+def chain_moves() -> str:
+    """A chain's held end leaps 200 mm in one tick; a loop of the forceps in ticks of 1 ms and of 50 ms."""
+    worst = 0.0
+    for links in (50, 200):
+        model = bare(links)
+        state, held = begin_chain(model, straight(model)), holds(model, [0], [[0, 0, 0]])
+        for k in range(30):
+            if k == 10:
+                held.target[0] = [120.0, 160.0, 0.0]
+            step_chain(model, state, held, TICK_S)
+            worst = max(worst, _level(state.x, model.link))
+    for tick in (1e-3, 5e-2):
+        model = bare(100)
+        state, held = begin_chain(model, straight(model)), holds(model, [0], [[0, 0, 0]])
+        for k in range(1, round(1.0 / tick) + 1):
+            held.target[0] = forceps(model, k * tick)
+            step_chain(model, state, held, tick)
+            worst = max(worst, _level(state.x, model.link))
+    return f"ok: lengths to {worst:.0e}"
+
+
 def cases() -> list[tuple[str, str, Callable[[], str]]]:
     """(case, method, what runs it): "ok: ..." or "refused: ..." with a number, or AssertionError where a law breaks."""
     return [
@@ -170,4 +222,6 @@ def cases() -> list[tuple[str, str, Callable[[], str]]]:
         ("ticks of 1 ms and of 50 ms", METHOD, ticks),
         ("a pose that is not a number, infinite or denormal", METHOD, not_a_number),
         ("zero-length and folded links at the start", METHOD, bad_starts),
+        ("chain pulled straight", CHAIN, chain_over_taut),
+        ("chain whose end leaps 200 mm; ticks of 1 ms and of 50 ms", CHAIN, chain_moves),
     ]

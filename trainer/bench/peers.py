@@ -1,13 +1,16 @@
-"""The bare chain's swing in MuJoCo, where it is installed beside the program; it is not a dependency.
+"""The bare chain's swing in MuJoCo and PyElastica, where they are installed beside the program; no dependencies.
 
-The same point masses on massless links with ball joints without friction, held at one end, let go from the horizontal.
-Each link is a body whose mass sits in a small sphere at its far end, so that the model differs from the reference by
-the sphere's own inertia, (r / d)², only.
+MuJoCo: the same point masses on massless links with ball joints without friction. Each link is a body whose mass sits
+in a small sphere at its far end, so that the model differs from the reference by the sphere's own inertia, (r / d)².
+PyElastica: a Cosserat rod, pinned at its first node, with as many elements as the chain has links. It stretches and
+bends: its radius and axial stiffness trade that error against the step, which its fastest wave bounds.
 """
 
 from __future__ import annotations
 
-from time import perf_counter_ns
+import math
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,67 +18,120 @@ import numpy as np
 from trainer.bench import thread
 from trainer.bench.rows import Row
 from trainer.geometry import Array
+from trainer.mechanics.thread_rod import Holds, RodModel, holds
 
 MUJOCO_STEPS_S = (5e-3, 2e-3, 1e-3, 5e-4)
-MISSING = "not measured: mujoco is not installed"
+ELASTICA = ((10.0, 1e-3), (3.0, 1e-3), (3.0, 5e-4))  # axial stiffness, N, and radius, m
+ELASTICA_STEP = 0.8  # of the shortest time that a wave of stretch takes along, or one of shear across, an element
+ROUNDS = 2
+CASE = "swing, bare"
+MISSING = "not measured: {} is not installed"
 
 
-def _chain(mujoco: Any, links: int, step_s: float) -> tuple[Any, Any]:
-    """MuJoCo's model and data of ``thread.bare(links)``, in m, kg and s."""
-    model = thread.bare(links)
-    link, mass = model.link * 1e-3, model.mass * model.link
-    bodies = ""
-    for i in range(links):
-        m = mass * (0.5 if i == links - 1 else 1.0)
-        place = 0.0 if i == 0 else link
-        bodies += (
-            f'<body pos="{place} 0 0"><joint type="ball" armature="0" damping="0"/>'
-            f'<inertial pos="{link} 0 0" mass="{m}" diaginertia="{m * 1e-8} {m * 1e-8} {m * 1e-8}"/>'
-        )
-    text = (
-        f'<mujoco><option timestep="{step_s}" gravity="0 0 -9.81" integrator="RK4"/>'
-        f'<compiler boundmass="0" boundinertia="0"/><worldbody>{bodies}{"</body>" * links}</worldbody></mujoco>'
-    )
-    built = mujoco.MjModel.from_xml_string(text)
-    return built, mujoco.MjData(built)
+class MuJoCo:
+    """MuJoCo's Runge-Kutta integrator at a step (s)."""
 
+    name = "mujoco ball chain"
 
-def _places(data: Any, links: int, link: float) -> Array:
-    """Nodes (links + 1, 3) mm."""
-    x = np.zeros((links + 1, 3))
-    x[:-1] = np.asarray(data.xpos)[1:] * 1e3
-    x[-1] = x[-2] + link * np.asarray(data.xmat)[-1].reshape(3, 3)[:, 0]
-    return x
-
-
-def measure(links: int = 50, steps_s: tuple[float, ...] = MUJOCO_STEPS_S) -> list[Row]:
-    """A row for each step of MuJoCo's Runge-Kutta integrator; without MuJoCo one row that says so."""
-    try:
+    def __init__(self, model: RodModel, step_s: float) -> None:
         import mujoco  # type: ignore[import-not-found, unused-ignore]
-    except ImportError:
-        nan = float("nan")
-        return [Row("swing, bare", links, "mujoco ball chain", "-", 0, nan, nan, nan, MISSING, nan, MISSING)]
+
+        self.engine, self.link, self.steps = mujoco, model.link, round(thread.FRAME_S / step_s)
+        self.setting = f"RK4, {step_s * 1e3:g} ms"
+        links, link, mass = model.count - 1, model.link * 1e-3, model.mass * model.link
+        bodies = ""
+        for i in range(links):
+            m = mass * (0.5 if i == links - 1 else 1.0)
+            place = 0.0 if i == 0 else link
+            bodies += (
+                f'<body pos="{place} 0 0"><joint type="ball" armature="0" damping="0"/>'
+                f'<inertial pos="{link} 0 0" mass="{m}" diaginertia="{m * 1e-8} {m * 1e-8} {m * 1e-8}"/>'
+            )
+        text = (
+            f'<mujoco><option timestep="{step_s}" gravity="0 0 -9.81" integrator="RK4"/>'
+            f'<compiler boundmass="0" boundinertia="0"/><worldbody>{bodies}{"</body>" * links}</worldbody></mujoco>'
+        )
+        self.built = mujoco.MjModel.from_xml_string(text)
+        self.data = mujoco.MjData(self.built)
+        mujoco.mj_forward(self.built, self.data)
+
+    def frame(self, before: Array, after: Array) -> Array:
+        for _ in range(self.steps):
+            self.engine.mj_step(self.built, self.data)
+        self.engine.mj_kinematics(self.built, self.data)
+        x = np.zeros((len(self.data.xpos), 3))
+        x[:-1] = np.asarray(self.data.xpos)[1:] * 1e3
+        x[-1] = x[-2] + self.link * np.asarray(self.data.xmat)[-1].reshape(3, 3)[:, 0]
+        return x
+
+
+class Elastica:
+    """PyElastica's position Verlet integrator with an axial stiffness (N) and a radius (m)."""
+
+    name = "pyelastica rod"
+
+    def __init__(self, model: RodModel, axial: float, radius: float) -> None:
+        import elastica  # type: ignore[import-not-found, unused-ignore]
+
+        links, length, mass = model.count - 1, model.length * 1e-3, model.mass * 1e3
+        area = math.pi * radius**2
+        self.rod = elastica.CosseratRod.straight_rod(
+            links, np.zeros(3), np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]), length, radius, mass / area,
+            youngs_modulus=axial / area, shear_modulus=axial / area / 2.0,
+        )  # fmt: skip
+
+        class Simulator(elastica.BaseSystemCollection, elastica.Constraints, elastica.Forcing):  # type: ignore[misc]
+            pass
+
+        simulator: Any = Simulator()
+        simulator.append(self.rod)
+        simulator.constrain(self.rod).using(
+            elastica.GeneralConstraint, constrained_position_idx=(0,),
+            translational_constraint_selector=np.array([True, True, True]),
+        )  # fmt: skip
+        simulator.add_forcing_to(self.rod).using(elastica.GravityForces, acc_gravity=np.array([0.0, 0.0, -9.81]))
+        simulator.finalize()
+        self.simulator, self.stepper, self.time = simulator, elastica.PositionVerlet(), np.float64(0.0)
+        wave = math.sqrt(axial / mass)
+        shortest = min(length / links / wave, 0.5 * radius / (wave * math.sqrt(0.5)))
+        self.steps = math.ceil(thread.FRAME_S / (ELASTICA_STEP * shortest))
+        self.setting = f"EA {axial:g} N, radius {radius * 1e3:g} mm, {thread.FRAME_S / self.steps:.1e} s"
+
+    def frame(self, before: Array, after: Array) -> Array:
+        for _ in range(self.steps):
+            self.time = self.stepper.step(self.simulator, self.time, np.float64(thread.FRAME_S / self.steps))
+        return np.ascontiguousarray(self.rod.position_collection.T) * 1e3
+
+
+def measure(links: int = 50) -> list[Row]:
+    """Rows of the rod, the chain and the peers that are found; of the others rows that say so.
+
+    Whole swings in turn, twice, of which the faster counts: frame by frame in turn each would find the caches full of
+    the others' numbers, which costs the lightest most.
+    """
     model = thread.bare(links)
     h = thread.reference_step(model, False)
-    expected = thread.answers(model, thread.still, h)
-    rows = []
-    for step_s in steps_s:
-        built, data = _chain(mujoco, links, step_s)
-        mujoco.mj_forward(built, data)
-        ms, error = [], 0.0
-        for frame in range(1, len(expected)):
-            begun = perf_counter_ns()
-            for _ in range(round(thread.FRAME_S / step_s)):
-                mujoco.mj_step(built, data)
-            ms.append((perf_counter_ns() - begun) * 1e-6)
-            mujoco.mj_kinematics(built, data)
-            far = np.linalg.norm(_places(data, links, model.link) - expected[frame], axis=1)
-            error = max(error, float(np.max(far)) / model.length)
-        median, p90 = (float(v) for v in np.percentile(ms, (50, 90)))
-        of = thread.ERROR_OF.format(thread.REFERENCE.format(links, h))
-        ended = "converged" if error < 1.0 else "lost"
-        rows.append(
-            Row("swing, bare", links, "mujoco ball chain", f"RK4, {step_s * 1e3:g} ms", len(ms), median, p90, error, of,
-                0.0, ended, thread.LENGTHS)
-        )  # fmt: skip
-    return rows
+
+    def held() -> Holds:
+        return holds(model, [0], [[0, 0, 0]])
+
+    builders: list[tuple[str, Callable[[], thread.Method]]] = []
+    builders += [("", partial(thread.Rod, model, held(), t * model.length, True)) for t in (1e-3, 1e-4, 1e-5)]
+    builders += [("", partial(thread.Chain, model, held(), t * model.length)) for t in (1e-3, 1e-5, 1e-6)]
+    builders += [("mujoco", partial(MuJoCo, model, step_s)) for step_s in MUJOCO_STEPS_S]
+    builders += [("elastica", partial(Elastica, model, *setting)) for setting in ELASTICA]
+    expected, of = thread.answers(model, thread.still, h), thread.REFERENCE.format(links, h)
+    rows: dict[tuple[str, str], Row] = {}
+    for _ in range(ROUNDS):
+        for name, build in builders:
+            try:
+                method = build()
+            except ImportError:
+                said, nan = MISSING.format(name), float("nan")
+                rows[name, "-"] = Row(CASE, links, name, "-", 0, nan, nan, nan, said, nan, said)
+                continue
+            (row,) = thread.run(CASE, model, thread.still, [method], expected, of)
+            key = row.method, row.setting
+            if key not in rows or row.median_ms < rows[key].median_ms:
+                rows[key] = row
+    return list(rows.values())

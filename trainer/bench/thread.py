@@ -1,4 +1,4 @@
-"""The thread's swing and drag: time against error of the rod, XPBD and follow-the-leader.
+"""The thread's swing and drag: time against error of the rod, the chain, XPBD and follow-the-leader.
 
 Two threads. *bare*: a chain of 1 m without stiffness in a vacuum, whose free end cracks like a whip: the hardest case
 for a step in time, and what peers can be given. *suture*: 100 mm of nylon as thin as 10-0 in air, what a scene holds.
@@ -15,6 +15,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from time import perf_counter_ns
+from typing import Protocol
 
 import numpy as np
 from numba import njit
@@ -22,6 +23,7 @@ from numba import njit
 from trainer.bench.rows import Row
 from trainer.geometry import Array
 from trainer.mechanics.thread import ThreadModel, follow
+from trainer.mechanics.thread_chain import begin_chain, step_chain
 from trainer.mechanics.thread_rod import Holds, RodModel, begin, holds, monofilament, step
 from trainer.mechanics.thread_xpbd import begin_xpbd, step_xpbd
 
@@ -168,6 +170,16 @@ def answers(model: RodModel, path: Path, h: float) -> Array:
     return np.array(found)
 
 
+class Method(Protocol):
+    """What is timed: a frame of a thread whose held end goes from ``before`` to ``after`` (3,) mm."""
+
+    name: str
+    setting: str
+
+    def frame(self, before: Array, after: Array) -> Array:
+        """Places (n, 3) mm at the frame's end."""
+
+
 class Rod:
     """The rod at a substep (s), or with a tolerance (mm) and substeps of its own."""
 
@@ -183,6 +195,21 @@ class Rod:
         for k in range(1, self.substeps + 1):
             self.held.target[0] = before + (after - before) * (k / self.substeps)
             step(self.state, self.held, FRAME_S / self.substeps, self.tolerance)
+        return self.state.x
+
+
+class Chain:
+    """The bare chain with a tolerance (mm)."""
+
+    name = "chain"
+
+    def __init__(self, model: RodModel, held: Holds, tolerance: float) -> None:
+        self.model, self.held, self.tolerance = model, held, tolerance
+        self.state, self.setting = begin_chain(model, straight(model)), f"tolerance {tolerance:g} mm a substep"
+
+    def frame(self, before: Array, after: Array) -> Array:
+        self.held.target[0] = after
+        step_chain(self.model, self.state, self.held, FRAME_S, self.tolerance)
         return self.state.x
 
 
@@ -219,15 +246,13 @@ class Leader:
 class Tally:
     """What the frames of one method came to."""
 
-    method: Rod | Beads | Leader
+    method: Method
     ms: list[float] = field(default_factory=list)
     error: float = 0.0
     stretch: float = 0.0
 
 
-def run(
-    case: str, model: RodModel, path: Path, methods: list[Rod | Beads | Leader], expected: Array, of: str
-) -> list[Row]:
+def run(case: str, model: RodModel, path: Path, methods: list[Method], expected: Array, of: str) -> list[Row]:
     """All methods frame by frame in turn, so that a noisy machine is noisy for all of them.
 
     ``expected`` (frames + 1, m, 3) at m places evenly along the thread; ``of`` says what it is.
@@ -257,15 +282,19 @@ def run(
     return rows
 
 
-def methods(model: RodModel, quick: bool, whip: bool, drag: bool) -> list[Rod | Beads | Leader]:
-    """The methods with their settings; ``whip``: substeps of the rod's own choice, ``drag``: follow-the-leader too."""
+def methods(model: RodModel, quick: bool, whip: bool, drag: bool) -> list[Method]:
+    """The methods with their settings; ``whip``: the chain, and substeps of the rod's own choice.
+
+    ``drag``: follow-the-leader too.
+    """
 
     def held() -> Holds:
         return holds(model, [0], [[0, 0, 0]])
 
-    chosen: list[Rod | Beads | Leader] = [Rod(model, held(), h, False) for h in (1e-2, 2e-3)]
+    chosen: list[Method] = [Rod(model, held(), h, False) for h in (1e-2, 2e-3)]
     if whip:
         chosen += [Rod(model, held(), t * model.length, True) for t in ((1e-4, 1e-5) if quick else (1e-4, 1e-5, 1e-6))]
+        chosen += [Chain(model, held(), t * model.length) for t in ((1e-5,) if quick else (1e-4, 1e-5, 1e-6, 1e-7))]
     elif not quick:
         chosen.append(Rod(model, held(), 1e-3, False))
     for substeps in (1, 10) if quick else (1, 10, 100):
@@ -280,7 +309,9 @@ def measure(quick: bool, sizes: tuple[int, ...] = (50, 200, 1000)) -> list[Row]:
     """
     links = 50 if quick else 200
     tiny = suture(50)
-    run("", tiny, still, methods(tiny, True, True, True), np.zeros((3, 51, 3)), "")  # compiles
+    run("", tiny, still, methods(tiny, True, False, True), np.zeros((3, 51, 3)), "")  # compiles
+    tiny = bare(50)
+    run("", tiny, still, methods(tiny, True, True, True), np.zeros((3, 51, 3)), "")
     rows: list[Row] = []
     for name, path in (("swing", still), ("drag", forceps)):
         for size in sizes:

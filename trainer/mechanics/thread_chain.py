@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from trainer.geometry import Array
-from trainer.mechanics.thread_chain_step import DONE, TAUT, ChainWork, Method, advance_chain
+from trainer.mechanics.thread_chain_step import DONE, ENDED, FORCE, HOLD, MASS, ROWS, STAGES, TAUT, advance_chain
 from trainer.mechanics.thread_rod import Holds, RodModel
 
 TOLERANCE = 1e-6  # lengths of the chain a substep, where none is asked for
@@ -32,16 +32,12 @@ class ChainStalled(ArithmeticError):
 
 
 @cache
-def method() -> Method:
-    """Dormand's and Prince's coefficients of order 8, as scipy holds them, and their squares for places."""
+def _coefficients() -> Array:
+    """Dormand's and Prince's of order 8 as scipy holds them, and their squares for places (29, 12)."""
     from scipy.integrate import DOP853
 
-    stages = DOP853.n_stages
-    speed = np.ascontiguousarray(DOP853.A[:stages, :stages])
-    end, error = DOP853.B, DOP853.E5[:stages]
-    return Method(*(np.ascontiguousarray(a) for a in (
-        DOP853.C[:stages], speed, speed @ speed, end, end @ speed, error, error @ speed,
-    )))  # fmt: skip
+    speed, end, error = DOP853.A[:STAGES, :STAGES], DOP853.B, DOP853.E5[:STAGES]
+    return np.vstack([speed, speed @ speed, end, end @ speed, error, error @ speed, DOP853.C[:STAGES]])
 
 
 @dataclass(frozen=True)
@@ -51,13 +47,9 @@ class ChainState:
     x: Array  # (n, 3) mm
     v: Array  # (n, 3) mm/s
     tension: Array  # (n,) mN of the link into each node, negative in compression; entry 0 is none
-    outcome: Array  # (6,) of the last tick: how it ended, substeps, refused ones, s to try next, hold and mN if taut
-    _mass: Array
-    _gravity: Array
+    numbers: Array  # (12,) as ``thread_chain_step`` names them: of the last tick the steps taken, refused …
     _secant: Array
-    _clock: Array
-    _holds: Array
-    _work: ChainWork
+    _rows: Array
 
 
 def _finite(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
@@ -83,16 +75,10 @@ def begin_chain(model: RodModel, x: ArrayLike, v: ArrayLike | None = None) -> Ch
     sizes = np.linalg.norm(np.diff(places, axis=0), axis=1)
     if np.max(np.abs(sizes - model.link)) > 1e-6 * model.link:
         raise ValueError(f"links must be {model.link} mm long, not {sizes.min():.6g} to {sizes.max():.6g}")
-    links, wide = n - 1, (3, n)
-    work = ChainWork(
-        np.zeros(wide), np.zeros(wide), np.zeros(wide), np.zeros(wide), np.zeros((len(method().at), *wide)),
-        np.zeros((3, links)), np.zeros(links), np.zeros(links), np.zeros(links), np.zeros(links), np.zeros(links),
-        np.zeros(n),
-    )  # fmt: skip
-    return ChainState(
-        places, speeds, np.zeros(n), np.zeros(6), model.mass * model.node_lengths(), np.array(model.gravity),
-        speeds.copy(), np.zeros(1), np.zeros((2, n, 3)), work,
-    )  # fmt: skip
+    rows = np.zeros((ROWS, n))
+    rows[MASS] = model.mass * model.node_lengths()
+    numbers = np.array([*[0.0] * 7, model.link, model.drag / model.mass, *model.gravity])
+    return ChainState(places, speeds, np.zeros(n), numbers, speeds.copy(), rows)
 
 
 def _check_reach(model: RodModel, held: Holds) -> None:
@@ -124,14 +110,12 @@ def step_chain(model: RodModel, state: ChainState, held: Holds, tick: float, tol
     if len(held.node) > 1:
         _check_reach(model, held)
     advance_chain(
-        method(), state._work, state.x, state.v, state.tension, state._mass, model.drag / model.mass, state._gravity,
-        model.link, held.node, held.target, held.limit, held.bears, state._holds[0], state._holds[1], state._secant,
-        tick, state._clock[0], allowed, state.outcome,
+        _coefficients(), state._rows, state.x, state.v, state.tension, state._secant, state.numbers, held.node,
+        held.target, held.limit, held.bears, tick, allowed,
     )  # fmt: skip
-    if state.outcome[0] == TAUT:
-        k = int(state.outcome[4])
-        force, limit = state.outcome[5], held.limit[k]
+    if state.numbers[ENDED] == TAUT:
+        k = int(state.numbers[HOLD])
+        force, limit = state.numbers[FORCE], held.limit[k]
         raise ChainTaut(f"node {held.node[k]} would pull with {force:.3g} mN, of which {limit:.3g} can be held")
-    if state.outcome[0] != DONE:
-        raise ChainStalled("no substep of the chain was short enough: it is taut, or moves faster than can be followed")
-    state._clock[0] = tick
+    if state.numbers[ENDED] != DONE:
+        raise ChainStalled("no substep of the chain was short enough: it is taut, or too fast to be followed")

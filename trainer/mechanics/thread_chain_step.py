@@ -34,33 +34,43 @@ MOST_STEPS = 5000  # a tick, refused ones too
 DONE, TAUT, STALLED = 0.0, 1.0, 2.0
 
 
-class Method(NamedTuple):
-    """Coefficients (12, 12) of speeds and places of the stages, (12,) of the result and its error."""
-
-    at: Array  # (12,) of the step
-    speed: Array
-    place: Array
-    end_speed: Array
-    end_place: Array
-    error_speed: Array
-    error_place: Array
+STAGES = 12
+# Rows of coefficients (29, 12): of speeds and places of the stages, of the result, of its error; when the stages are.
+SPEED, PLACE, END_SPEED, END_PLACE, ERROR_SPEED, ERROR_PLACE, WHEN = 0, 12, 24, 25, 26, 27, 28
+# Numbers of a chain: what ``advance_chain`` reads and says.
+ENDED, STEPS, REFUSED, NEXT, HOLD, FORCE, BEFORE, LENGTH, DRAG, GRAVITY = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9
+MASS, ROWS = 63, 67  # of memory, n numbers each: the masses' row, and how many
 
 
 class ChainWork(NamedTuple):
-    """Memory of a step: nothing in it outlives a tick but ``mobility``'s own mass."""
+    """Memory of a step by name: nothing in it outlives a tick but the masses."""
 
     x: Array  # (3, n)
     v: Array
     stage_x: Array
     stage_v: Array
+    link: Array  # (3, n), the last column is none
+    begin: Array  # (3, n): of the k-th hold in column k the acceleration at the tick's start, mm/s²
+    grow: Array  # its growth, mm/s³
     gain: Array  # (12, 3, n) accelerations of the stages
-    link: Array  # (3, n - 1)
     diagonal: Array  # (n - 1,)
     beside: Array
     right: Array
     share: Array
-    pull: Array  # 1/s² a link's tension over its length and over the mass of a node inside
+    pull: Array  # 1/s²: a link's tension over its length and over the mass of a node inside
     mobility: Array  # (n,) 1 inside, 2 at the ends, 0 where held
+    mass: Array  # (n,) kg
+    zero: Array  # (3, n)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _by_name(rows: Array) -> ChainWork:
+    n = rows.shape[1]
+    return ChainWork(
+        rows[0:3], rows[3:6], rows[6:9], rows[9:12], rows[12:15], rows[15:18], rows[18:21],
+        rows[21:57].reshape(STAGES, 3, n), rows[57][:-1], rows[58][:-1], rows[59][:-1], rows[60][:-1], rows[61][:-1],
+        rows[62], rows[MASS], rows[64:67],
+    )  # fmt: skip
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -68,14 +78,14 @@ def _links(x: Array, mobility: Array, link: Array, diagonal: Array, beside: Arra
     """Links and the matrix of their tensions: J W Jᵀ of the lengths' Jacobian J and the mobilities W."""
     x0, x1, x2 = x[0], x[1], x[2]
     a0, a1, a2, b0, b1, b2 = x0[:-1], x1[:-1], x2[:-1], x0[1:], x1[1:], x2[1:]
-    e0, e1, e2 = link[0], link[1], link[2]
+    e0, e1, e2 = link[0][:-1], link[1][:-1], link[2][:-1]
     w, u = mobility[:-1], mobility[1:]
     for j in range(len(e0)):
         p, q, r = b0[j] - a0[j], b1[j] - a1[j], b2[j] - a2[j]
         e0[j], e1[j], e2[j] = p, q, r
         diagonal[j] = (p * p + q * q + r * r) * (w[j] + u[j])
     f0, f1, f2 = e0[1:], e1[1:], e2[1:]
-    for j in range(len(f0)):
+    for j in range(len(e0) - 1):
         beside[j] = (e0[j] * f0[j] + e1[j] * f1[j] + e2[j] * f2[j]) * u[j]
 
 
@@ -140,55 +150,63 @@ def _approach(v: Array, link: Array, right: Array) -> None:
     """The speed at which each link would grow, times its length."""
     v0, v1, v2 = v[0], v[1], v[2]
     a0, a1, a2, b0, b1, b2 = v0[:-1], v1[:-1], v2[:-1], v0[1:], v1[1:], v2[1:]
-    e0, e1, e2 = link[0], link[1], link[2]
+    e0, e1, e2 = link[0][:-1], link[1][:-1], link[2][:-1]
     for j in range(len(right)):
         right[j] = e0[j] * (b0[j] - a0[j]) + e1[j] * (b1[j] - a1[j]) + e2[j] * (b2[j] - a2[j])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _accelerate(
-    work: ChainWork, v: Array, gain: Array, gravity: Array, drag: float, holds: NDArray[np.int32], begin: Array,
-    grow: Array, time: float,
-) -> None:  # fmt: skip
+def _accelerate(work: ChainWork, v: Array, gain: Array, numbers: Array, holds: NDArray[np.int32], time: float) -> None:
     """Accelerations ``gain`` (3, n) of a chain whose ``links`` are known; held nodes have begin + grow time."""
-    for c in range(3):
-        row, speed, g = gain[c], v[c], gravity[c]
-        for i in range(len(row)):
-            row[i] = g - drag * speed[i]
-        for k in range(len(holds)):
-            row[holds[k]] = begin[k, c] + grow[k, c] * time
-    v0, v1, v2, f0, f1, f2 = v[0], v[1], v[2], gain[0], gain[1], gain[2]
+    v0, v1, v2 = v[0], v[1], v[2]
     a0, a1, a2, b0, b1, b2 = v0[:-1], v1[:-1], v2[:-1], v0[1:], v1[1:], v2[1:]
-    c0, c1, c2, d0, d1, d2 = f0[:-1], f1[:-1], f2[:-1], f0[1:], f1[1:], f2[1:]
-    e0, e1, e2, right = work.link[0], work.link[1], work.link[2], work.right
-    for j in range(len(right)):
+    e0, e1, e2 = work.link[0][:-1], work.link[1][:-1], work.link[2][:-1]
+    right, pull, w = work.right, work.pull, work.mobility
+    drag, last = numbers[DRAG], len(right)
+    for j in range(last):  # weight and air: alike for both ends of a link, but for the air that it meets in growing
         p, q, r = b0[j] - a0[j], b1[j] - a1[j], b2[j] - a2[j]
-        pull = e0[j] * (d0[j] - c0[j]) + e1[j] * (d1[j] - c1[j]) + e2[j] * (d2[j] - c2[j])
-        right[j] = p * p + q * q + r * r + pull
-    _solve(work.diagonal, work.beside, right, work.share, work.pull)
-    _spread(work.pull, work.link, work.mobility, gain)
+        right[j] = p * p + q * q + r * r - drag * (e0[j] * p + e1[j] * q + e2[j] * r)
+    for k in range(len(holds)):
+        i = holds[k]
+        for c in range(3):
+            extra = work.begin[c, k] + work.grow[c, k] * time - (numbers[GRAVITY + c] - drag * v[c, i])
+            if i > 0:
+                right[i - 1] += work.link[c, i - 1] * extra
+            if i < last:
+                right[i] -= work.link[c, i] * extra
+    _solve(work.diagonal, work.beside, right, work.share, pull)
+    for c in range(3):
+        row, speed, g, e = gain[c], v[c], numbers[GRAVITY + c], work.link[c]
+        f, z, o, u, m = e[1:], pull[1:], row[1:], speed[1:], w[1:]
+        for j in range(last - 1):
+            o[j] = g - drag * u[j] + m[j] * (z[j] * f[j] - pull[j] * e[j])
+        row[0] = g - drag * speed[0] + w[0] * pull[0] * e[0]
+        row[last] = g - drag * speed[last] - w[last] * pull[last - 1] * e[last - 1]
+        for k in range(len(holds)):
+            row[holds[k]] = work.begin[c, k] + work.grow[c, k] * time
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _add_four(out: Array, a: float, k: Array, b: float, m: Array, c: float, p: Array, d: float, q: Array) -> None:
-    for i in range(len(out)):
-        out[i] += a * k[i] + b * m[i] + c * p[i] + d * q[i]
+def _stage(
+    at_x: Array, at_v: Array, x: Array, v: Array, gains: Array, place: Array, speed: Array, h: float, go: float,
+    stages: int,
+) -> None:  # fmt: skip
+    """at_x = x + go v + h² Σ place gains and at_v = v + h Σ speed gains, (3n,), over the first ``stages`` (3n,) gains.
 
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _combine(out: Array, gain: Array, weights: Array, scale: float, stages: int) -> None:
-    """out (3n,) += scale · sum of weights[j] gain[j] over the stages; the weights past them are 0."""
+    Four at a time; weights past the stages are 0.
+    """
     for j in range(0, stages, 4):
-        _add_four(
-            out, scale * weights[j], gain[j], scale * weights[j + 1], gain[j + 1], scale * weights[j + 2], gain[j + 2],
-            scale * weights[j + 3], gain[j + 3],
-        )  # fmt: skip
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _go_on(out: Array, x: Array, v: Array, h: float) -> None:
-    for i in range(len(out)):
-        out[i] = x[i] + h * v[i]
+        g0, g1, g2, g3 = gains[j], gains[j + 1], gains[j + 2], gains[j + 3]
+        p0, p1, p2, p3 = h * h * place[j], h * h * place[j + 1], h * h * place[j + 2], h * h * place[j + 3]
+        s0, s1, s2, s3 = h * speed[j], h * speed[j + 1], h * speed[j + 2], h * speed[j + 3]
+        if j == 0:
+            for i in range(len(at_x)):
+                at_x[i] = x[i] + go * v[i] + (p0 * g0[i] + p1 * g1[i] + (p2 * g2[i] + p3 * g3[i]))
+                at_v[i] = v[i] + (s0 * g0[i] + s1 * g1[i] + (s2 * g2[i] + s3 * g3[i]))
+        else:
+            for i in range(len(at_x)):
+                at_x[i] += p0 * g0[i] + p1 * g1[i] + (p2 * g2[i] + p3 * g3[i])
+                at_v[i] += s0 * g0[i] + s1 * g1[i] + (s2 * g2[i] + s3 * g3[i])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -197,7 +215,7 @@ def _project(work: ChainWork, x: Array, v: Array, length: float) -> bool:
     right = work.right
     for _ in range(MOST_PROJECTIONS):
         _links(x, work.mobility, work.link, work.diagonal, work.beside)
-        e0, e1, e2 = work.link[0], work.link[1], work.link[2]
+        e0, e1, e2 = work.link[0][:-1], work.link[1][:-1], work.link[2][:-1]
         worst = 0.0
         for j in range(len(right)):
             right[j] = 0.5 * (e0[j] * e0[j] + e1[j] * e1[j] + e2[j] * e2[j] - length * length)
@@ -228,28 +246,26 @@ def _longest(work: ChainWork, drag: float) -> float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _size(out: Array, gains: Array, weights: Array, scale: float, stages: int) -> float:
-    """The largest entry of scale · sum of weights[j] gains[j]; ``out`` (3n,) is overwritten."""
-    out[:] = 0.0
-    _combine(out, gains, weights, scale, stages)
-    most = 0.0
-    for i in range(len(out)):
-        most = max(most, abs(out[i]))
-    return most
+def _largest(rows: Array) -> float:
+    """Of the entries of (3, n), without their signs: three at a time."""
+    r0, r1, r2 = rows[0], rows[1], rows[2]
+    p = q = r = 0.0
+    for i in range(len(r0)):
+        p, q, r = max(p, abs(r0[i])), max(q, abs(r1[i])), max(r, abs(r2[i]))
+    return max(p, q, r)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _bear(
-    work: ChainWork, gain: Array, mass: Array, drag: float, gravity: Array, holds: NDArray[np.int32],
-    bears: Array,
+    work: ChainWork, gain: Array, numbers: Array, holds: NDArray[np.int32], bears: Array
 ) -> None:  # fmt: skip
     """The force (k, 3) mN of each hold: what its node's momentum asks for beyond weight, air and links."""
     last = len(work.pull)
-    inside = mass[1]
+    inside = work.mass[1]
     for k in range(len(holds)):
         i = holds[k]
         for c in range(3):
-            force = mass[i] * (gain[c, i] - gravity[c] + drag * work.v[c, i])
+            force = work.mass[i] * (gain[c, i] - numbers[GRAVITY + c] + numbers[DRAG] * work.v[c, i])
             if i > 0:
                 force += inside * work.pull[i - 1] * work.link[c, i - 1]
             if i < last:
@@ -258,86 +274,92 @@ def _bear(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def advance_chain(
-    method: Method, work: ChainWork, x: Array, v: Array, tension: Array, mass: Array, drag: float, gravity: Array,
-    length: float, holds: NDArray[np.int32], targets: Array, limit: Array, bears: Array, begin: Array, grow: Array,
-    secant: Array, tick: float, tick_before: float, tolerance: float, outcome: Array,
+def _paths(
+    work: ChainWork, x: Array, v: Array, holds: NDArray[np.int32], targets: Array, secant: Array, tick: float,
+    before: float,
 ) -> None:  # fmt: skip
-    """One tick. ``x``, ``v`` (n, 3) and ``tension`` (n,) change only if it succeeds: ``outcome`` (6,) says
+    """Accelerations of the holds on the cubics from where and how fast they are to ``targets`` (k, 3).
 
-    how it ended, steps, refused steps, the step to try next (s), and of a taut chain the hold and its force (mN).
-    A hold goes along the cubic that has its speed at the start and at the end that of the parabola through its last
-    three places. ``secant`` (n, 3) mm/s keeps its mean speed of the tick before, ``tick_before`` s.
+    The speed there is that of the parabola through the last three places; ``secant`` (n, 3) mm/s was the mean speed
+    in the tick before, which lasted ``before`` s.
     """
-    n = len(x)
-    for i in range(n):
-        work.mobility[i] = mass[1] / mass[i]
-        for c in range(3):
-            work.x[c, i], work.v[c, i] = x[i, c], v[i, c]
     for k in range(len(holds)):
         i = holds[k]
         work.mobility[i] = 0.0
         for c in range(3):
             mean = (targets[k, c] - x[i, c]) / tick
             change = mean - secant[i, c]
-            end = mean + (change * tick / (tick + tick_before) if tick_before > 0.0 else 0.5 * change)
-            begin[k, c] = (6.0 * mean - 4.0 * v[i, c] - 2.0 * end) / tick
-            grow[k, c] = 6.0 * (v[i, c] + end - 2.0 * mean) / (tick * tick)
-    stages, size = len(method.at), 3 * n
-    gains, at_x, at_v = work.gain.reshape(stages, size), work.stage_x.reshape(size), work.stage_v.reshape(size)
-    now_x, now_v = work.x.reshape(size), work.v.reshape(size)
-    outcome[0] = STALLED
-    outcome[1] = outcome[2] = 0.0
+            end = mean + (change * tick / (tick + before) if before > 0.0 else 0.5 * change)
+            work.begin[c, k] = (6.0 * mean - 4.0 * v[i, c] - 2.0 * end) / tick
+            work.grow[c, k] = 6.0 * (v[i, c] + end - 2.0 * mean) / (tick * tick)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def advance_chain(
+    coefficients: Array, rows: Array, x: Array, v: Array, tension: Array, secant: Array, numbers: Array,
+    holds: NDArray[np.int32], targets: Array, limit: Array, bears: Array, tick: float, tolerance: float,
+) -> None:  # fmt: skip
+    """One tick. ``x``, ``v``, ``secant`` (n, 3) and ``tension`` (n,) change only if it succeeds: ``numbers`` say how
+
+    it ended, steps, refused steps, the step to try next (s), and of a taut chain the hold and its force (mN).
+    """
+    n = len(x)
+    work = _by_name(rows)
+    length, drag = numbers[LENGTH], numbers[DRAG]
+    for i in range(n):
+        work.mobility[i] = work.mass[1] / work.mass[i]
+        for c in range(3):
+            work.x[c, i], work.v[c, i] = x[i, c], v[i, c]
+    _paths(work, x, v, holds, targets, secant, tick, numbers[BEFORE])
+    size = 3 * n
+    gains, at_x, at_v = work.gain.reshape(STAGES, size), work.stage_x.reshape(size), work.stage_v.reshape(size)
+    now_x, now_v, zero = work.x.reshape(size), work.v.reshape(size), work.zero.reshape(size)
+    numbers[ENDED] = STALLED
+    numbers[STEPS] = numbers[REFUSED] = 0.0
     if not _project(work, work.x, work.v, length):
         return
-    _accelerate(work, work.v, work.gain[0], gravity, drag, holds, begin, grow, 0.0)
+    _accelerate(work, work.v, work.gain[0], numbers, holds, 0.0)
     bound = _longest(work, drag)
-    h = outcome[3] if outcome[3] > 0.0 else tick
+    h = numbers[NEXT] if numbers[NEXT] > 0.0 else tick
     done = 0.0
     for _ in range(MOST_STEPS):
         left = tick - done
         taken = left / math.ceil(left / min(h, bound) * (1.0 - 1e-9))
-        for s in range(1, stages):
-            _go_on(at_x, now_x, now_v, method.at[s] * taken)
-            _combine(at_x, gains, method.place[s], taken * taken, s)
-            at_v[:] = now_v
-            _combine(at_v, gains, method.speed[s], taken, s)
+        for s in range(1, STAGES):
+            go = coefficients[WHEN, s] * taken
+            _stage(at_x, at_v, now_x, now_v, gains, coefficients[PLACE + s], coefficients[SPEED + s], taken, go, s)
             _links(work.stage_x, work.mobility, work.link, work.diagonal, work.beside)
-            time = done + method.at[s] * taken
-            _accelerate(work, work.stage_v, work.gain[s], gravity, drag, holds, begin, grow, time)
-        error = max(
-            _size(at_x, gains, method.error_place, taken * taken, stages),
-            _size(at_x, gains, method.error_speed, taken * taken, stages),
-        )
-        _go_on(at_x, now_x, now_v, taken)
-        _combine(at_x, gains, method.end_place, taken * taken, stages)
-        at_v[:] = now_v
-        _combine(at_v, gains, method.end_speed, taken, stages)
+            _accelerate(work, work.stage_v, work.gain[s], numbers, holds, done + go)
+        place, speed = coefficients[ERROR_PLACE], coefficients[ERROR_SPEED]
+        _stage(at_x, at_v, zero, zero, gains, place, speed, taken, 0.0, STAGES)
+        error = max(_largest(work.stage_x), taken * _largest(work.stage_v))
+        place, speed = coefficients[END_PLACE], coefficients[END_SPEED]
+        _stage(at_x, at_v, now_x, now_v, gains, place, speed, taken, taken, STAGES)
         if not (error <= tolerance and _project(work, work.stage_x, work.stage_v, length)):
-            outcome[2] += 1.0
+            numbers[REFUSED] += 1.0
             change = SAFETY * (tolerance / error) ** (1.0 / 6.0) if error > tolerance else LEAST_CHANGE
             h = taken * max(LEAST_CHANGE, change)
-            work.gain[1:] = 0.0  # what is not finite would outlive its step in sums with a weight of 0
+            gains[1:] = 0.0  # what is not finite would outlive its step in sums with a weight of 0
             continue
-        outcome[1] += 1.0
+        numbers[STEPS] += 1.0
         now_x[:] = at_x
         now_v[:] = at_v
         done = tick if taken >= left else done + taken
         change = SAFETY * (tolerance / error) ** (1.0 / 6.0) if error > 0.0 else MOST_CHANGE
         h = taken * min(MOST_CHANGE, max(LEAST_CHANGE, change))
-        _accelerate(work, work.v, work.gain[0], gravity, drag, holds, begin, grow, done)
+        _accelerate(work, work.v, work.gain[0], numbers, holds, done)
         bound = _longest(work, drag)
-        _bear(work, work.gain[0], mass, drag, gravity, holds, bears)
+        _bear(work, work.gain[0], numbers, holds, bears)
         for k in range(len(holds)):
             force = math.sqrt(bears[k, 0] ** 2 + bears[k, 1] ** 2 + bears[k, 2] ** 2)
             if force > limit[k]:
-                outcome[0], outcome[4], outcome[5] = TAUT, float(k), force
+                numbers[ENDED], numbers[HOLD], numbers[FORCE] = TAUT, float(k), force
                 return
         if done == tick:
             break
     if done < tick:
         return
-    outcome[0], outcome[3] = DONE, h
+    numbers[ENDED], numbers[NEXT], numbers[BEFORE] = DONE, h, tick
     for k in range(len(holds)):
         i = holds[k]
         for c in range(3):
@@ -345,7 +367,7 @@ def advance_chain(
             work.x[c, i] = targets[k, c]
     for i in range(n):
         if i > 0:
-            tension[i] = work.pull[i - 1] * mass[1] * length
+            tension[i] = work.pull[i - 1] * work.mass[1] * length
         for c in range(3):
             if work.mobility[i] > 0.0:
                 secant[i, c] = work.v[c, i]
