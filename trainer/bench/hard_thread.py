@@ -11,7 +11,7 @@ from trainer.bench.thread import bare, forceps, straight, suture
 from trainer.geometry import Array
 from trainer.mechanics.thread_chain import ChainTaut, begin_chain, step_chain
 from trainer.mechanics.thread_contact import clear, touch_itself, touch_triangles
-from trainer.mechanics.thread_rod import RodModel, RodState, begin, holds, no_contacts, settle, step
+from trainer.mechanics.thread_rod import RodModel, RodStalled, RodState, begin, holds, no_contacts, settle, step
 
 TICK_S = 0.01
 METHOD, CHAIN = "rod", "chain"
@@ -85,9 +85,15 @@ def heap() -> str:
         touch_triangles(contacts, state.x, radius, floor, floor, one, down, 0.3, 1.0)
         touch_itself(contacts, state.x, radius, np.stack([i, j], axis=1).astype(np.int32), 0.3, 0.1)
         most = max(most, int(contacts.used[0]))
-        step(state, nothing, 2e-3, 0.0, contacts)
+        stalled = ""
+        try:
+            step(state, nothing, 2e-3, 0.0, contacts)
+        except RodStalled as error:  # said, and the rod is where it was: a thousand contacts are at the edge of it
+            stalled = str(error)
         worst = max(worst, _sound(model, state))
         assert state.x[:, 2].min() > 0.0, "a node is below the floor"
+        if stalled:
+            return f"not converged: {stalled} ({most} contacts)"
     return (
         f"ok: up to {most} contacts, lowest node {state.x[:, 2].min():.2f} mm above the floor, lengths to {worst:.0e}"
     )
