@@ -41,6 +41,8 @@ def command_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[
                 print(end.code, file=sys.stderr)
             code = end.code if isinstance(end.code, int) else int(end.code is not None)
         out, err = capsys.readouterr()
-        return code, out, err
+        # Whoever comes first on a machine is told to wait; which test that is, is chance.
+        lines = [line for line in err.splitlines(keepends=True) if not line.startswith("compiling kernels once")]
+        return code, out, "".join(lines)
 
     return run
