@@ -91,4 +91,6 @@ def test_hard_cases_hold(case: str, method: str, run: Callable[[], str]) -> None
     assert case
     assert method
     outcome = run()
-    assert outcome.startswith(("ok: ", "refused: ", "not converged: ")), outcome
+    # Five hundred contacts are at the edge of the rod's Newton: of all cases the heap alone may say that it stalled.
+    stalled = case.endswith("heap") and outcome.startswith("not converged: no substep")
+    assert stalled or outcome.startswith(("ok: ", "refused: ")), outcome
