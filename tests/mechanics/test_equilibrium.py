@@ -13,7 +13,7 @@ from trainer.config import Sourced
 from trainer.curriculum import VesselSpec
 from trainer.geometry import Array, Rigid, quaternion_from_axis_angle
 from trainer.mechanics import banded
-from trainer.mechanics.attachments import Anchors, Cable, Loads
+from trainer.mechanics.attachments import Anchors, Cable, Frictions
 from trainer.mechanics.equilibrium import Equilibrium
 from trainer.mechanics.links import blocks, forces, hessian, link_mesh
 from trainer.mechanics.minimise import CABLE_MM, MOST_STEPS, STEP_MM
@@ -153,15 +153,49 @@ def test_an_anchor_s_force_is_what_the_tissue_and_its_clamps_give_back(tissue: T
     assert np.abs(answer.anchor_force[0] + support).max() < 2e-6
 
 
-def test_load_and_anchor_are_two_sides_of_one_equilibrium(tissue: Tissue) -> None:
-    """The force that an anchor gave, given as a load, leads to the same place."""
+def sliding(state: Equilibrium, slot: int, force: Array) -> Frictions:
+    """Friction that is overcome by far: it gives its limit, which is ``force`` (3,) mN."""
+    size = float(np.linalg.norm(force))
+    place = state.position(slot) + 10.0 * force / size
+    return Frictions(np.array([slot]), place[None], force[None] / size, np.array([1e3]), np.array([size]))
+
+
+def test_sliding_friction_and_anchor_are_two_sides_of_one_equilibrium(tissue: Tissue) -> None:
+    """The force that an anchor gave, given by what slides past, leads to the same place."""
     state = state_of(tissue)
     slot = hold(state, tissue, 1, 0.0, 0.35)
     answer = state.solve(spring(state, slot, np.array([0.0, 0.0, -0.1])), tolerance_mN=1e-8)
     held = state.x.copy()
-    answer = state.solve(loads=Loads(np.array([slot]), answer.anchor_force), tolerance_mN=1e-8)
+    answer = state.solve(frictions=sliding(state, slot, answer.anchor_force[0]), tolerance_mN=1e-8)
     assert answer.converged
     assert np.abs(state.x - held).max() < 1e-6
+
+
+@pytest.mark.parametrize("stiffness", [1.0, 1e2, 1e4])
+def test_friction_draws_until_it_slides_and_never_overshoots(tissue: Tissue, stiffness: float) -> None:
+    """A point between a friction k, at most F, and a spring K whose ends part by s goes k s / (k + K) until that is
+    F / K, whatever the ratio of k and K: K follows from the first, small, way.
+
+    The tissue is hardly bent at 0.1 mN: its own stiffness changes by less than a hundredth.
+    """
+    state = state_of(tissue)
+    slot, limit, along = hold(state, tissue, 1, 0.0, 0.35), 0.1, np.array([0.0, 0.0, 1.0])
+    rest = state.position(slot)
+
+    def drawn(way: float) -> float:
+        rub = Frictions(
+            np.array([slot]), (rest + way * along)[None], along[None], np.array([stiffness]), np.array([limit])
+        )
+        assert state.solve(frictions=rub, tolerance_mN=1e-9, max_iterations=200).converged
+        return float((state.position(slot) - rest) @ along)
+
+    little = 1e-3 * limit / stiffness
+    own = stiffness * (little / drawn(little) - 1.0)
+    slides_at = limit / stiffness + limit / own
+    assert drawn(0.5 * slides_at) == pytest.approx(0.5 * limit / own, rel=0.01)
+    for way in (2.0 * slides_at, 100.0 * slides_at):
+        assert drawn(way) == pytest.approx(limit / own, rel=0.01)
+    assert drawn(-2.0 * slides_at) == pytest.approx(-limit / own, rel=0.01)
 
 
 def test_a_hole_slides_along_a_needle(tissue: Tissue) -> None:
@@ -298,9 +332,9 @@ def test_a_factor_made_anew_changes_the_way_and_not_the_answer(tissue: Tissue, b
             if i == 30:
                 more = hold(s, tissue, 0, 2.0, 0.3)
             move = np.array([0.02 * np.sin(0.4 * i), 0.02 * np.cos(0.3 * i), bend_mm * min(1.0, (i + 1) / 12)])
-            load = Loads(np.array([more]), np.array([[0.0, 0.1, 0.0]])) if i >= 30 else None
+            rub = sliding(s, more, np.array([0.0, 0.1, 0.0])) if i >= 30 else None
             anchor = Anchors(np.array([slot]), (start + move)[None], 1e4 * np.eye(3)[None])
-            answer = s.solve(anchor, loads=load, tolerance_mN=1e-7, max_iterations=300)
+            answer = s.solve(anchor, frictions=rub, tolerance_mN=1e-7, max_iterations=300)
             assert answer.converged
             used.append(answer.iterations)
         iterations.append(np.median(used[-20:]))
@@ -312,7 +346,9 @@ def test_a_factor_made_anew_changes_the_way_and_not_the_answer(tissue: Tissue, b
     "held",
     [
         lambda a: {"anchors": Anchors(np.array([a]), np.full((1, 3), np.nan), np.eye(3)[None])},
-        lambda a: {"loads": Loads(np.array([a]), np.full((1, 3), np.inf))},
+        lambda a: {
+            "frictions": Frictions(np.array([a]), np.full((1, 3), np.inf), np.eye(3)[:1], np.ones(1), np.ones(1))
+        },
         lambda a: {"cables": (Cable(np.array([a, -1]), np.full((2, 3), np.nan), 1.0, OPEN[:2]),)},
     ],
 )

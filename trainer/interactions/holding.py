@@ -13,7 +13,7 @@ from trainer.instruments.needle import needle_point, needle_tangent
 from trainer.interactions import giving_way, pierce, thread_pull
 from trainer.interactions.giving_way import Grips
 from trainer.interactions.world import Hole, World
-from trainer.mechanics.attachments import Anchors, Loads
+from trainer.mechanics.attachments import Anchors, Frictions
 
 #: Stiffness of what holds the tissue, in units of modulus times wall thickness: a hundred times the wall's own,
 #: so that a held point is off its place by a hundredth of the dent that the force makes.
@@ -61,17 +61,30 @@ def grips(world: World) -> Grips:
     )
 
 
-def drag(world: World) -> Loads:
-    """Friction of needle and thread in their holes."""
+def drag(world: World) -> Frictions:
+    """Friction of needle and thread in their holes, which carry the tissue along until they slide."""
     scene = world.task.scene
-    slot, force = [], []
+    slot, place, along, limit = [], [], [], []
     for hole in world.open_holes():
         on_needle = world.needle is not None and hole.arc <= world.needle.length
         spec = scene.needle if on_needle else scene.thread
-        if spec is not None and hole.drawn_mm != 0.0:
-            slot.append(hole.slot)
-            force.append(spec.drag_mN.value * hole.drawn_mm / pierce.FULL_DRAG_MM * hole.along)
-    return Loads(np.array(slot, dtype=np.int64), np.array(force).reshape(-1, 3)) if slot else Loads.none()
+        if spec is None or spec.drag_mN.value == 0.0:
+            continue
+        if on_needle:
+            assert world.needle is not None
+            arc = max(hole.arc, 0.0)
+            at = world.needle_pose.apply(needle_point(world.needle, arc))
+            way = world.needle_pose.rotate(needle_tangent(world.needle, arc))
+        else:
+            at, way = world.point(hole.place), hole.along
+        slot.append(hole.slot)
+        place.append(at + hole.drawn_mm * way)
+        along.append(way)
+        limit.append(spec.drag_mN.value)
+    if not slot:
+        return Frictions.none()
+    most = np.array(limit)
+    return Frictions(np.array(slot, dtype=np.int64), np.array(place), np.array(along), most / pierce.FULL_DRAG_MM, most)
 
 
 def equilibrate(world: World, before: Rigid, start_s: float, span_s: float, tool: str, tolerance_mN: float) -> None:

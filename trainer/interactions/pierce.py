@@ -128,7 +128,6 @@ def follow_needle(world: World, time_s: float, tool: str) -> None:
         at = world.needle_pose.inverse().apply(world.point(hole.place))
         arc = _arc_through(world, at)
         draw(hole, arc)
-        hole.along = world.needle_pose.rotate(needle_tangent(world.needle, min(max(arc, 0.0), length)))
         beyond = (world.needle_pose.position - world.point(hole.place)) @ hole.normal
         hole.reached_mm = max(hole.reached_mm, float(-beyond if hole.inwards else beyond))
         shared = {

@@ -61,7 +61,7 @@ class Hole:
     arc: float  # mm along needle and thread from the tip, of what is in the hole
     reached_mm: float = 0.0  # how far the tip got beyond the wall
     drawn_mm: float = 0.0  # how far what runs through it, towards the tip, has drawn the tissue along; bounded
-    along: Array = field(default_factory=lambda: np.zeros(3))  # (3,) direction in which it runs
+    along: Array = field(default_factory=lambda: np.zeros(3))  # (3,) direction in which the thread runs through it
     open: bool = True  # False once needle and thread have left it, or it tore
     torn: bool = False
 

@@ -1,4 +1,4 @@
-"""What holds a tissue at material points: springs to places in the world and taut threads.
+"""What holds a tissue at material points: springs to places in the world, taut threads, and what rubs in a hole.
 
 A material point is a weighted mean of three nodes. At most a few dozen are held at a time, so that everything here is
 a small dense problem in the 3 u coordinates of the u points in use.
@@ -48,19 +48,27 @@ class Cable:
 
 
 @dataclass(frozen=True)
-class Loads:
-    """Given forces at material points."""
+class Frictions:
+    """What rubs along a line at material points: Coulomb friction with an elastic way before it slides (Dahl 1968).
 
-    slot: np.ndarray  # (l,) int
-    force: Array  # (l, 3) mN
+    The force on the tissue is ``stiffness`` (``place`` - p) · ``along``, of at most ``limit`` either way. Within one
+    equilibrium it follows from a convex energy, so that it cannot overshoot from one direction to the other, however
+    soft the tissue is along the line. The caller moves ``place`` on afterwards by what has slid.
+    """
+
+    slot: np.ndarray  # (f,) int
+    place: Array  # (f, 3) mm, where the point feels no friction
+    along: Array  # (f, 3) unit
+    stiffness: Array  # (f,) mN/mm, positive
+    limit: Array  # (f,) mN
 
     @staticmethod
-    def none() -> Loads:
-        return Loads(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
+    def none() -> Frictions:
+        return Frictions(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0))
 
 
 class Rows(NamedTuple):
-    """Anchors, cables and loads of one solve, flattened for the kernels; ``at`` counts the points in use."""
+    """Anchors, cables and frictions of one solve, flattened for the kernels; ``at`` counts the points in use."""
 
     slots: np.ndarray  # (u,) the slots in use, ascending
     anchor_at: np.ndarray  # (a,)
@@ -71,10 +79,14 @@ class Rows(NamedTuple):
     cable_place: Array  # (k, 3) mm
     channel: np.ndarray  # (k,) bool
     length: Array  # (c,) mm; changed while lengths are approached in steps
-    load: Array  # (u, 3) mN
+    rub_at: np.ndarray  # (f,)
+    rub_place: Array  # (f, 3) mm
+    rub_along: Array  # (f, 3)
+    rub_stiffness: Array  # (f,) mN/mm
+    rub_limit: Array  # (f,) mN
 
 
-def flatten(anchors: Anchors, cables: tuple[Cable, ...], loads: Loads) -> Rows:
+def flatten(anchors: Anchors, cables: tuple[Cable, ...], frictions: Frictions) -> Rows:
     """The rows of one solve. Raises ValueError when a number is not finite or a cable has fewer than two points."""
     count = [len(c.slot) for c in cables]
     cable_slot = np.array([n for c in cables for n in c.slot.tolist()], dtype=np.int64)
@@ -88,18 +100,18 @@ def flatten(anchors: Anchors, cables: tuple[Cable, ...], loads: Loads) -> Rows:
         ("an anchor's stiffness", anchors.stiffness),
         ("a cable's place", cable_place),
         ("a cable's length", length),
-        ("a load", loads.force),
+        ("a friction's place", frictions.place),
+        ("a friction's direction", frictions.along),
+        ("a friction's stiffness", frictions.stiffness),
+        ("a friction's limit", frictions.limit),
     ):
         if values.size and not np.isfinite(values).all():
             raise ValueError(f"{name} is not finite")
     if any(n < 2 for n in count):
         raise ValueError("a cable needs at least two points")
-    on_anchors, on_cables, on_loads = anchors.slot.tolist(), cable_slot.tolist(), loads.slot.tolist()
-    slots = sorted({*on_anchors, *(n for n in on_cables if n >= 0), *on_loads})
+    on_anchors, on_cables, rubbed = anchors.slot.tolist(), cable_slot.tolist(), frictions.slot.tolist()
+    slots = sorted({*on_anchors, *(n for n in on_cables if n >= 0), *rubbed})
     at = {-1: -1} | {slot: u for u, slot in enumerate(slots)}
-    load = np.zeros((len(slots), 3))
-    for slot, f in zip(on_loads, loads.force, strict=True):
-        load[at[slot]] += f
     return Rows(
         slots=np.array(slots, dtype=np.int64),
         anchor_at=np.array([at[n] for n in on_anchors], dtype=np.int64),
@@ -110,7 +122,11 @@ def flatten(anchors: Anchors, cables: tuple[Cable, ...], loads: Loads) -> Rows:
         cable_place=cable_place,
         channel=np.array([n for c in cables for n in c.channel.tolist()], dtype=np.bool_),
         length=length,
-        load=load,
+        rub_at=np.array([at[n] for n in rubbed], dtype=np.int64),
+        rub_place=frictions.place,
+        rub_along=frictions.along,
+        rub_stiffness=frictions.stiffness,
+        rub_limit=frictions.limit,
     )
 
 
@@ -140,8 +156,7 @@ def pull(
     matrix[:] = 0.0
     for i in range(len(p)):
         for r in range(3):
-            force[i, r] = rows.load[i, r]
-            energy -= rows.load[i, r] * p[i, r]
+            force[i, r] = 0.0
     for a in range(len(anchor_at)):
         i = anchor_at[a]
         for r in range(3):
@@ -151,6 +166,19 @@ def pull(
                 matrix[3 * i + r, 3 * i + c] += anchor_stiffness[a, r, c]
             force[i, r] += f
             energy += 0.5 * f * (target[a, r] - p[i, r])
+    for n in range(len(rows.rub_at)):
+        i, k, limit = rows.rub_at[n], rows.rub_stiffness[n], rows.rub_limit[n]
+        drawn = 0.0
+        for r in range(3):
+            drawn += (rows.rub_place[n, r] - p[i, r]) * rows.rub_along[n, r]
+        f = min(limit, max(-limit, k * drawn))
+        energy += f * drawn - 0.5 * f * f / k
+        slides = abs(k * drawn) > limit
+        for r in range(3):
+            force[i, r] += f * rows.rub_along[n, r]
+            for c in range(3):
+                if not slides:
+                    matrix[3 * i + r, 3 * i + c] += k * rows.rub_along[n, r] * rows.rub_along[n, c]
     for n in range(len(rows.length)):
         first, last = cable_start[n], cable_start[n + 1]
         path = 0.0

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from trainer.geometry import Array
-from trainer.mechanics.attachments import Anchors, Cable, Loads, Rows, flatten
+from trainer.mechanics.attachments import Anchors, Cable, Frictions, Rows, flatten
 from trainer.mechanics.compliance import FREE, Compliance
 from trainer.mechanics.links import LinkMesh
 from trainer.mechanics.minimise import Base, Bodies, Held, Memory, approach
@@ -46,7 +46,7 @@ class _Group(NamedTuple):
     bodies: list[int]
     anchors: list[int]
     cables: list[int]
-    loads: list[int]
+    frictions: list[int]
 
 
 class Equilibrium:
@@ -106,7 +106,7 @@ class Equilibrium:
         self,
         anchors: Anchors | None = None,
         cables: tuple[Cable, ...] = (),
-        loads: Loads | None = None,
+        frictions: Frictions | None = None,
         tolerance_mN: float = 1e-3,
         max_iterations: int = 60,
     ) -> Result:
@@ -117,14 +117,14 @@ class Equilibrium:
         that the tissue is in equilibrium at each instant). Raises ValueError when a given number is not finite.
         """
         anchors = Anchors.none() if anchors is None else anchors
-        loads = Loads.none() if loads is None else loads
-        groups = self._groups(anchors, cables, loads)
+        frictions = Frictions.none() if frictions is None else frictions
+        groups = self._groups(anchors, cables, frictions)
         self._rest(groups)
         found = Result(True, 0, 0.0, 1.0, np.zeros((len(anchors.slot), 3)), np.zeros(len(cables)), 0.0)
         targets: dict[int, Array] = {}
         tension: dict[tuple[int, ...], float] = {}
         for group in groups:
-            part = self._solve(group, anchors, cables, loads, tolerance_mN, max_iterations, targets, tension)
+            part = self._solve(group, anchors, cables, frictions, tolerance_mN, max_iterations, targets, tension)
             found.anchor_force[group.anchors] = part.anchor_force
             found.tension[group.cables] = part.tension
             found = Result(
@@ -145,7 +145,7 @@ class Equilibrium:
         group: _Group,
         all_anchors: Anchors,
         all_cables: tuple[Cable, ...],
-        all_loads: Loads,
+        all_frictions: Frictions,
         tolerance_mN: float,
         max_iterations: int,
         targets: dict[int, Array],
@@ -156,7 +156,12 @@ class Equilibrium:
         if len(a) < len(anchors.slot):
             anchors = Anchors(anchors.slot[a], anchors.target[a], anchors.stiffness[a])
         cables = tuple(all_cables[c] for c in group.cables)
-        rows = flatten(anchors, cables, Loads(all_loads.slot[group.loads], all_loads.force[group.loads]))
+        f, frictions = group.frictions, all_frictions
+        if len(f) < len(frictions.slot):
+            frictions = Frictions(
+                frictions.slot[f], frictions.place[f], frictions.along[f], frictions.stiffness[f], frictions.limit[f]
+            )
+        rows = flatten(anchors, cables, frictions)
         held = self._held(group.bodies, rows, cables)
         way = np.zeros_like(rows.target)
         for n, slot in enumerate(anchors.slot.tolist()):
@@ -182,15 +187,15 @@ class Equilibrium:
             cable_error_mm=max(0.0, *held.stretch.tolist()) if cables else 0.0,
         )
 
-    def _groups(self, anchors: Anchors, cables: tuple[Cable, ...], loads: Loads) -> list[_Group]:
+    def _groups(self, anchors: Anchors, cables: tuple[Cable, ...], frictions: Frictions) -> list[_Group]:
         """The bodies that something holds, those that a cable joins together. Raises ValueError for a free slot, and
         for a cable through no material point."""
-        on_anchors, on_loads = self._bodies_of(anchors.slot), self._bodies_of(loads.slot)
+        on_anchors, rubbed = self._bodies_of(anchors.slot), self._bodies_of(frictions.slot)
         on_cables = [self._bodies_of(cable.slot[cable.slot >= 0]) for cable in cables]
         if not all(on_cables):
             raise ValueError("a cable runs through no material point")
         groups: list[set[int]] = []
-        for joined in [*({b} for b in on_anchors), *({b} for b in on_loads), *map(set, on_cables)]:
+        for joined in [*({b} for b in on_anchors), *({b} for b in rubbed), *map(set, on_cables)]:
             apart = [g for g in groups if not g & joined]
             groups = [*apart, joined.union(*(g for g in groups if g & joined))]
         return [
@@ -198,7 +203,7 @@ class Equilibrium:
                 bodies=sorted(group),
                 anchors=[n for n, b in enumerate(on_anchors) if b in group],
                 cables=[n for n, through in enumerate(on_cables) if through[0] in group],
-                loads=[n for n, b in enumerate(on_loads) if b in group],
+                frictions=[n for n, b in enumerate(rubbed) if b in group],
             )
             for group in sorted(groups, key=min)
         ]
