@@ -131,6 +131,13 @@ def flatten(anchors: Anchors, cables: tuple[Cable, ...], frictions: Frictions) -
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def tension_of(multiplier: float, penalty: float, stretch: float, taut: bool) -> float:
+    """A cable's tension, mN, see :func:`pull`."""
+    tension = multiplier + penalty * stretch
+    return tension if taut else max(0.0, tension)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def pull(
     p: Array,
     rows: Rows,
@@ -140,12 +147,14 @@ def pull(
     force: Array,
     matrix: Array,
     stretch: Array,
+    taut: np.ndarray,
 ) -> float:
     """Forces on the points in use, their stiffness and their energy (mN mm, returned).
 
     A cable of path length s, longest length L, multiplier m and penalty k has the augmented Lagrangian
     (T² - m²) / (2 k) with the tension T = max(0, m + k (s - L)) (Rockafellar 1973). Its second derivative,
-    k d dᵀ + T ∂²s/∂p² with d = ∂s/∂p, is positive semidefinite, because a path length is convex.
+    k d dᵀ + T ∂²s/∂p² with d = ∂s/∂p, is positive semidefinite, because a path length is convex. Of a cable that is
+    expected to be ``taut`` (c,) in the end the path is an equation: on the way there it may push.
 
     Reads ``p`` (u, 3) mm, ``rows``, ``multiplier`` (c,) mN, ``penalty`` (c,) mN/mm. Overwrites ``row``
     (k, 3), ``force`` (u, 3) mN, ``matrix`` (3 u, 3 u) mN/mm and ``stretch`` (c,) = s - L mm.
@@ -201,7 +210,7 @@ def pull(
             row[k + 1, 1] += d1 / s
             row[k + 1, 2] += d2 / s
         stretch[n] = path - rows.length[n]
-        tension = max(0.0, multiplier[n] + penalty[n] * stretch[n])
+        tension = tension_of(multiplier[n], penalty[n], stretch[n], taut[n])
         energy += (tension * tension - multiplier[n] * multiplier[n]) / (2.0 * penalty[n])
         if tension == 0.0:
             continue
@@ -225,11 +234,12 @@ def pull(
             d1 = (p[j, 1] if j >= 0 else cable_place[k + 1, 1]) - (p[i, 1] if i >= 0 else cable_place[k, 1])
             d2 = (p[j, 2] if j >= 0 else cable_place[k + 1, 2]) - (p[i, 2] if i >= 0 else cable_place[k, 2])
             s = max(math.sqrt(d0 * d0 + d1 * d1 + d2 * d2), SHORTEST_MM)
+            bending = max(0.0, tension)
             for r in range(3):
                 dr = d0 if r == 0 else (d1 if r == 1 else d2)
                 for c in range(3):
                     dc = d0 if c == 0 else (d1 if c == 1 else d2)
-                    g = tension / s * ((1.0 if r == c else 0.0) - dr * dc / (s * s))
+                    g = bending / s * ((1.0 if r == c else 0.0) - dr * dc / (s * s))
                     if i >= 0:
                         matrix[3 * i + r, 3 * i + c] += g
                     if j >= 0:

@@ -24,7 +24,7 @@ from trainer.mechanics.minimise import Base, Bodies, Held, Memory, approach
 #: Secant pairs kept from one solve to the next: fewer take more iterations where a thread draws at the tissue.
 PAIRS = 8
 #: More iterations than this in a solve: the kept factor no longer serves, begin a new one.
-SLOW = 6
+SLOW = 4
 
 
 @dataclass(frozen=True)
@@ -176,7 +176,7 @@ class Equilibrium:
         if iterations > steps * SLOW or not converged:
             self.compliance.refresh(group.bodies, self.x)
         targets.update(zip(anchors.slot.tolist(), rows.target, strict=True))
-        tensions.update(zip(map(_key, cables), held.multiplier.tolist(), strict=True))
+        tensions.update(zip(map(_key, cables), tension.tolist(), strict=True))
         return Result(
             converged=converged and reached == 1.0,
             iterations=iterations,
@@ -243,6 +243,7 @@ class Equilibrium:
                 force=np.zeros((u, 3)),
                 matrix=np.zeros((3 * u, 3 * u)),
                 stretch=np.zeros(c),
+                taut=np.zeros(c, dtype=np.bool_),
                 moved=np.zeros((PAIRS, u, 3)),
                 pulled=np.zeros((PAIRS, u, 3)),
                 rest=np.zeros((u, 3)),

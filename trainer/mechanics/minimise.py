@@ -14,7 +14,7 @@ from numba import njit
 
 from trainer.geometry import Array
 from trainer.mechanics import banded
-from trainer.mechanics.attachments import Rows, pull
+from trainer.mechanics.attachments import Rows, pull, tension_of
 from trainer.mechanics.links import add_forces
 from trainer.mechanics.quasi_newton import (
     add_scaled,
@@ -33,8 +33,8 @@ STEP_MM = 0.1
 MOST_STEPS = 8
 #: On the way to a target that has leapt, the residual may be so many times the tolerance.
 STEP_TOLERANCE = 100.0
-#: A cable's path may be longer than the cable by this much, mm.
-CABLE_MM = 1e-5
+#: A cable's path may be longer than the cable by this much, mm: a fifth of what nodes are off in a stitch.
+CABLE_MM = 5e-4
 #: A cable's penalty, as a multiple of the tissue's own stiffness along it: with 1000 every other first step overshoots.
 CABLE_PENALTY = 1e2
 #: Sufficient decrease (Armijo), and the shortest step tried.
@@ -94,6 +94,7 @@ class Held(NamedTuple):
     force: Array  # (u, 3) mN
     matrix: Array  # (3 u, 3 u) mN/mm
     stretch: Array  # (c,) mm
+    taut: np.ndarray  # (c,) bool, see attachments.pull
     moved: Array  # (pairs, u, 3)
     pulled: Array  # (pairs, u, 3)
     rest: Array  # (u, 3) mN
@@ -108,7 +109,9 @@ class Held(NamedTuple):
 def pull_points(x: Array, rows: Rows, held: Held) -> float:
     """The energy of what holds the points at ``x`` (n, 3); leaves their forces and their stiffness behind."""
     at_points(x, held.nodes, held.weights, held.point)
-    return pull(held.point, rows, held.multiplier, held.penalty, held.row, held.force, held.matrix, held.stretch)
+    return pull(
+        held.point, rows, held.multiplier, held.penalty, held.row, held.force, held.matrix, held.stretch, held.taut
+    )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -203,15 +206,30 @@ def largest(a: Array, bodies: Bodies, held: Held) -> float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def tension(held: Held, c: int) -> float:
+    """A cable's tension at the last evaluation, mN."""
+    return tension_of(held.multiplier[c], held.penalty[c], held.stretch[c], held.taut[c])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def expect_taut(held: Held) -> None:
+    """Which cables will be taut: those that were, unless the tissue gives less way than they are slack."""
+    for c in range(len(held.taut)):
+        soft = held.penalty[c] / CABLE_PENALTY
+        held.taut[c] = held.multiplier[c] > 0.0 and held.multiplier[c] + soft * held.stretch[c] > 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def tensions_are_settled(held: Held) -> bool:
-    """Whether each cable's multiplier is its tension within CABLE_MM; it is set to the tension if one is not."""
+    """Whether each cable pulls, and its multiplier is its tension within CABLE_MM; they are put right if not."""
     settled = True
     for c in range(len(held.stretch)):
-        tension = max(0.0, held.multiplier[c] + held.penalty[c] * held.stretch[c])
-        settled = settled and abs(tension - held.multiplier[c]) <= CABLE_MM * held.penalty[c]
+        pulls = tension(held, c) >= 0.0
+        settled = settled and pulls and abs(tension(held, c) - held.multiplier[c]) <= CABLE_MM * held.penalty[c]
+        held.taut[c] = held.taut[c] and pulls
     if not settled:
         for c in range(len(held.stretch)):
-            held.multiplier[c] = max(0.0, held.multiplier[c] + held.penalty[c] * held.stretch[c])
+            held.multiplier[c] = tension(held, c)
     return settled
 
 
@@ -227,6 +245,8 @@ def minimise(
     max_iterations: int,
 ) -> tuple[bool, int, float]:
     """Moves ``x`` (n, 3) until the residual and the cables' excess are small: (converged, iterations, residual mN)."""
+    pull_points(x, rows, held)
+    expect_taut(held)
     energy = evaluate(x, bodies, rows, held, memory)
     residual = gradient(bodies, held, memory)
     for iteration in range(max_iterations):
@@ -268,7 +288,7 @@ def minimise(
         residual = gradient(bodies, held, memory)
     converged = residual <= tolerance_mN
     for c in range(len(held.stretch)):
-        converged = converged and held.stretch[c] <= CABLE_MM
+        converged = converged and held.stretch[c] <= CABLE_MM and tension(held, c) >= 0.0
     return converged, max_iterations, residual
 
 
@@ -285,14 +305,15 @@ def approach(
     tolerance_mN: float,
     max_iterations: int,
     anchor_force: Array,
-    tension: Array,
+    tensions: Array,
 ) -> tuple[bool, int, int, float, float]:
     """Moves ``x`` (n, 3) to equilibrium while the anchors' targets go there the straight ``way`` (a, 3) mm.
 
     In steps of STEP_MM, in which cables are shortened, too. ``rows`` keeps the targets and lengths that were reached.
     Returns whether the last step converged, the iterations, the steps, the residual mN, and the least share of a way
-    that was gone. Overwrites ``way``, ``excess`` (c,) mm, ``anchor_force`` (a, 3) and ``tension`` (c,) mN.
+    that was gone. Overwrites ``way``, ``excess`` (c,) mm, ``anchor_force`` (a, 3) and ``tensions`` (c,) mN.
     """
+    held.taut[:] = False
     pull_points(x, rows, held)
     set_penalties(base, rows, held)
     far = 0.0
@@ -331,8 +352,8 @@ def approach(
             for c in range(3):
                 off = rows.target[a, c] - held.point[rows.anchor_at[a], c]
                 anchor_force[a, r] += rows.stiffness[a, r, c] * off
-    for c in range(len(tension)):
-        tension[c] = max(0.0, held.multiplier[c] + held.penalty[c] * held.stretch[c])
+    for c in range(len(tensions)):
+        tensions[c] = max(0.0, tension(held, c))
     return converged, iterations, steps, residual, reached
 
 
