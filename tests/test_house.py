@@ -37,7 +37,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "mechanics": {"geometry"},
     "anatomy": {"config", "curriculum", "geometry", "mechanics"},
     "instruments": {"config", "curriculum", "geometry", "poses", "mechanics"},
-    "interactions": DATA | {"mechanics", "anatomy", "instruments"},
+    "interactions": DATA | {"mechanics", "anatomy", "instruments", "view"},
     "log": {"config", "events", "geometry", "poses"},
     "sinks": {"events", "geometry", "poses", "log"},
     "scene": DATA | {"mechanics", "anatomy", "instruments", "interactions", "view", "sinks"},

@@ -16,13 +16,13 @@ from trainer.events import Aborted, Event, StepDone, TaskDone, TaskStarted, Trac
 from trainer.geometry import Array, Rigid, quaternion_from_axes, quaternion_from_euler_deg, slerp
 from trainer.instruments import forceps
 from trainer.instruments.needle import Needle, needle_point, needle_tangent
-from trainer.interactions import giving_way, goal, grasp, holding, pierce, thread_pull
+from trainer.interactions import giving_way, goal, grasp, holding, pierce, seeing, thread_pull
 from trainer.interactions.world import Jaw, World
 from trainer.mechanics.equilibrium import Equilibrium
 from trainer.mechanics.thread import ThreadModel
 from trainer.poses import ToolPoses
 from trainer.sinks.surface import Frame, InstrumentPart, Layout, Surface
-from trainer.view import HoleView, View
+from trainer.view import View
 
 #: A tick in which an instrument or the needle's tip moves further than this is taken in several movements, mm.
 STRIDE_MM = 0.1
@@ -97,7 +97,8 @@ class Scene:
         self.outcome = ""  # completed, failed, aborted or timeout; empty while it runs
         self.reason = ""
         self.tick = 0
-        self.home = self._poses()
+        self.home = seeing.poses(world)
+        self._axes = {v.spec.name: world.world_from_scene.rotate(v.axis) for v in self._vessels()}
         self.steps_done = 0
         self._passes_used: set[int] = set()
 
@@ -224,33 +225,7 @@ class Scene:
 
     def view(self) -> View:
         """What a trainee sees now."""
-        world, out = self.world, self.world.world_from_scene
-        return View(
-            tick=self.tick,
-            time_s=self.tick / world.task.tick_hz,
-            poses=self._poses(),
-            look=self._look,
-            vessel_axis={v.spec.name: out.rotate(v.axis) for v in self._vessels()},
-            world_from_needle=out @ world.needle_pose if world.needle is not None else None,
-            needle_holders=tuple(
-                sorted((i for i, j in enumerate(world.jaws) if j.target == "needle"), key=lambda i: world.jaws[i].since)
-            ),
-            thread_holders=tuple(i for i, j in enumerate(world.jaws) if j.target == "thread"),
-            holes=tuple(
-                HoleView(
-                    world.vessel_name(h.place),
-                    h.place.wall,
-                    "in" if h.inwards else "out",
-                    out.apply(world.point(h.place)),
-                    h.arc,
-                )
-                for h in world.open_holes()
-            ),
-            thread=out.apply(world.nodes) if world.thread is not None else None,
-            tail_mm=thread_pull.tail_mm(world),
-            gap_mm=goal.gap_mm(world),
-            steps_done=self.steps_done,
-        )
+        return seeing.SceneView(self.world, self.tick, self.steps_done, self._axes)
 
     def layout(self) -> Layout:
         """What does not change during the exercise, for a recording."""
@@ -297,28 +272,6 @@ class Scene:
 
     def _vessels(self) -> tuple[vessels.Vessel, ...]:
         return self.world.tissue.vessels if self.world.tissue is not None else ()
-
-    def _poses(self) -> ToolPoses:
-        jaws = self.world.jaws
-        poses = [self.world.world_from_scene @ j.pose for j in jaws]
-        return ToolPoses(
-            np.array([pose.position for pose in poses]),
-            np.array([pose.quaternion for pose in poses]),
-            np.array([j.closure for j in jaws]),
-            np.array([j.seen for j in jaws]),
-        )
-
-    def _look(self, name: str, clock_deg: float, axial_mm: float, hull: str) -> tuple[Array, Array]:
-        """Where a marked place of a wall is now, and its undented outward normal."""
-        world = self.world
-        assert world.tissue is not None and world.solver is not None
-        index = next(i for i, v in enumerate(world.tissue.vessels) if v.spec.name == name)
-        v = world.tissue.vessels[index]
-        x = world.solver.x[world.tissue.nodes(index)]
-        clock = math.radians(clock_deg)
-        nodes, weights = vessels.wall_point(v, clock, axial_mm, "inner" if hull == "inner" else "outer")
-        out = world.world_from_scene
-        return out.apply(weights @ x[nodes]), out.rotate(vessels.undented_normal(v, x, clock, axial_mm))
 
 
 def _part_way(a: Rigid, b: Rigid, share: float) -> Rigid:

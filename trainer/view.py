@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 from trainer.geometry import Array, Rigid
 from trainer.poses import ToolPoses
-
-#: (vessel, clock_deg, axial_mm, hull) → the point of the wall now (3,) mm, and its undented outward normal (3,).
-Look = Callable[[str, float, float, str], tuple[Array, Array]]
 
 
 @dataclass(frozen=True)
@@ -23,20 +20,53 @@ class HoleView:
     arc_mm: float  # what is in it: distance along needle and thread from the needle's tip
 
 
-@dataclass(frozen=True)
-class View:
-    """Plain values; ``look`` answers where a marked place of a wall is at this tick."""
+class View(ABC):
+    """The scene as it is now, each thing worked out when it is looked at: to be read before the scene moves on."""
 
     tick: int
     time_s: float
-    poses: ToolPoses  # where the instruments are
-    look: Look
-    vessel_axis: dict[str, Array]  # from the cut into the end (3,), at rest
-    world_from_needle: Rigid | None
-    needle_holders: tuple[int, ...]  # instruments that hold the needle
-    thread_holders: tuple[int, ...]  # instruments that hold the thread
-    holes: tuple[HoleView, ...]
-    thread: Array | None  # (n, 3) mm nodes, from the needle to the free end
-    tail_mm: float  # thread left before the first hole
-    gap_mm: float  # between the edges at the stitch
     steps_done: int  # of the task
+    vessel_axis: dict[str, Array]  # from the cut into the end (3,), at rest
+
+    @abstractmethod
+    def look(self, vessel: str, clock_deg: float, axial_mm: float, hull: str) -> tuple[Array, Array]:
+        """Where a marked place of a wall is (3,) mm, and its undented outward normal (3,)."""
+
+    @property
+    @abstractmethod
+    def poses(self) -> ToolPoses:
+        """Where the instruments are."""
+
+    @property
+    @abstractmethod
+    def world_from_needle(self) -> Rigid | None: ...
+
+    @property
+    @abstractmethod
+    def needle_holders(self) -> tuple[int, ...]:
+        """The instruments that hold the needle, who took it first before the others."""
+
+    @property
+    @abstractmethod
+    def thread_holders(self) -> tuple[int, ...]:
+        """The instruments that hold the thread."""
+
+    @property
+    @abstractmethod
+    def holes(self) -> tuple[HoleView, ...]:
+        """The holes that needle or thread goes through."""
+
+    @property
+    @abstractmethod
+    def thread(self) -> Array | None:
+        """Nodes (n, 3) mm, from the needle to the free end."""
+
+    @property
+    @abstractmethod
+    def tail_mm(self) -> float:
+        """Thread left before the first hole."""
+
+    @property
+    @abstractmethod
+    def gap_mm(self) -> float:
+        """Between the edges at the stitch."""
