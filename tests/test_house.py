@@ -21,7 +21,7 @@ PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 
 #: What each part of trainer/ may import of the others. Data first, then the simulation upwards, then what reads
 #: the log: it never sees a scene, so a session can be scored on a machine that cannot simulate.
-DATA = {"config", "curriculum", "data_files", "events", "geometry", "poses"}
+DATA = {"config", "curriculum", "data_files", "events", "geometry", "motion", "poses"}
 MAY_IMPORT: dict[str, set[str]] = {
     "__init__": set(),
     "config": set(),
@@ -30,6 +30,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "geometry": set(),
     "clock": set(),
     "poses": {"geometry"},
+    "motion": {"config", "geometry"},
     "view": {"geometry", "poses"},
     "curriculum": {"config", "data_files"},
     "profile": {"config", "data_files"},

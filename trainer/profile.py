@@ -39,8 +39,16 @@ class Sensor:
     name: str
     tool: Literal["left", "right"]
     closure: float = field(default=1.0, metadata={"bounds": Bounds(0.0, 1.0)})  # jaws, where none are recorded
+    jaw_open_deg: float | None = field(default=None, metadata=ANGLE_DEG)  # where an angle of the jaws is recorded:
+    jaw_closed_deg: float | None = field(default=None, metadata=ANGLE_DEG)  # at which they are open, and closed
     position_mm: Vector = field(default=(0.0, 0.0, 0.0), metadata=POSITION_MM)  # sensor_from_tool
     rotation_deg: Vector = field(default=(0.0, 0.0, 0.0), metadata=ANGLE_DEG)  # about x, then y, then z
+
+    def __post_init__(self) -> None:
+        if (self.jaw_open_deg is None) != (self.jaw_closed_deg is None):
+            raise ValueError("'jaw_open_deg' and 'jaw_closed_deg' go together")
+        if self.jaw_open_deg is not None and self.jaw_open_deg == self.jaw_closed_deg:
+            raise ValueError("'jaw_open_deg' and 'jaw_closed_deg' must differ")
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,6 @@ from trainer.config import ConfigError
 from trainer.curriculum import Task, load_task
 from trainer.drivers import open_driver, open_profile, recording
 from trainer.drivers.driver import Driver
-from trainer.drivers.sequence_file import SequenceFile, Track
 from trainer.geometry import (
     Array,
     Rigid,
@@ -19,6 +18,7 @@ from trainer.geometry import (
     quaternion_from_axis_angle,
     quaternion_from_euler_deg,
 )
+from trainer.motion import Motion, Track
 from trainer.poses import ToolPoses
 
 REAL = Path(__file__).parents[3] / "shared/data/tracker/WaterTankBottomTranslationTrackerBuffer.igs.mha"
@@ -46,7 +46,7 @@ def home(task: Task) -> ToolPoses:
     )
 
 
-def sequence(time: Array, number: list[int] | None = None, ok: list[bool] | None = None) -> SequenceFile:
+def sequence(time: Array, number: list[int] | None = None, ok: list[bool] | None = None) -> Motion:
     """One sensor with constant velocity and constant rate of rotation."""
     track = Track(
         position=START + np.outer(time - time[0], VELOCITY),
@@ -54,10 +54,10 @@ def sequence(time: Array, number: list[int] | None = None, ok: list[bool] | None
         ok=np.ones(len(time), dtype=bool) if ok is None else np.array(ok),
     )
     frame_number = np.arange(len(time)) if number is None else np.array(number)
-    return SequenceFile("made", time, frame_number, {"ProbeToTracker": track})
+    return Motion("made", time, frame_number, {"ProbeToTracker": track})
 
 
-def sampled(s: SequenceFile, hz: float = 100.0) -> tuple[Array, Array, Array, np.ndarray]:
+def sampled(s: Motion, hz: float = 100.0) -> tuple[Array, Array, Array, np.ndarray]:
     time = recording.tick_times(s, hz)
     return time, *recording.resample(s, s.track("Probe"), time, hz)
 
@@ -73,7 +73,7 @@ def drain(driver: Driver) -> list[ToolPoses]:
     return out
 
 
-def write(path: Path, s: SequenceFile, sensors: tuple[str, ...] = ("Probe", "Stylus")) -> Path:
+def write(path: Path, s: Motion, sensors: tuple[str, ...] = ("Probe", "Stylus")) -> Path:
     """The motion of ``s`` as a file, all digits written, for each of ``sensors``; Stylus 100 mm aside."""
     n = len(s.time)
     lines = ["ObjectType = Image", f"DimSize = 0 0 {n}", "ElementType = MET_UCHAR"]

@@ -14,7 +14,9 @@ from hypothesis import strategies as st
 
 from trainer.config import ConfigError
 from trainer.drivers import sequence_file
+from trainer.drivers.plausible import ROTATION_TOLERANCE
 from trainer.geometry import matrix_from_quaternion, quaternion_from_axis_angle
+from trainer.motion import describe
 
 REAL = Path(__file__).parents[3] / "shared/data/tracker/WaterTankBottomTranslationTrackerBuffer.igs.mha"
 needs_real = pytest.mark.skipif(not REAL.exists(), reason=f"the real recording {REAL.name} is not beside the checkout")
@@ -186,7 +188,7 @@ def test_rotations_of_a_14_bit_tracker_pass() -> None:
     q /= np.linalg.norm(q, axis=1, keepdims=True)
     r = np.vectorize(lambda v: float(f"{v:.6g}"))(matrix_from_quaternion(np.floor(q * 8192) / 8192))
     error = np.abs(r.transpose(0, 2, 1) @ r - np.eye(3)).max()
-    assert 0.2 * sequence_file.ROTATION_TOLERANCE < error < sequence_file.ROTATION_TOLERANCE
+    assert 0.2 * ROTATION_TOLERANCE < error < ROTATION_TOLERANCE
 
 
 FUZZED = sequence_bytes(4, "3 2 {n}", "MET_SHORT", bytes(48))
@@ -228,7 +230,7 @@ def test_the_real_recording_holds_what_an_independent_reading_finds() -> None:
         position = np.array([row.split() for row in found], dtype=np.float64)[:, [3, 7, 11]]
         track = got.track(sensor)
         length = np.sqrt(((position[1:] - position[:-1]) ** 2).sum(axis=1)).sum()
-        ours = sequence_file.describe(got)["sensors"][sensor]["path_length_mm"]  # type: ignore[index]
+        ours = describe(got)["sensors"][sensor]["path_length_mm"]  # type: ignore[index]
         assert ours == pytest.approx(length, rel=1e-9)
         step = 36 * 25.4 / 8192
         off_grid = np.abs(track.position / step - np.round(track.position / step)) * step

@@ -12,7 +12,8 @@ import pytest
 from tests.metrics.synthetic_session import DRIVE, performed, record, task_of
 from trainer.events import from_row
 from trainer.exports import csv_files
-from trainer.exports.csv_files import FILES, ExportError, write
+from trainer.exports.csv_files import FILES, write
+from trainer.exports.files import ExportError
 from trainer.metrics import score
 
 FULL = Path("/dev/full")

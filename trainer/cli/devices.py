@@ -58,9 +58,12 @@ def _check(reference: str) -> dict[str, Any] | None:
     """What the recording behind ``reference`` holds; None for a profile that names none. Raises ConfigError."""
     from trainer import drivers
     from trainer.config import ConfigError
+    from trainer.drivers.motion_file import read
     from trainer.drivers.recording import check_sensors
-    from trainer.drivers.sequence_file import describe, read
+    from trainer.motion import describe
 
+    if drivers.is_recording(reference) and not drivers.is_logged(reference):
+        return {"path": reference, **describe(read(reference))}  # it need not have the sensors of a shipped profile
     file = drivers.open_profile(reference)
     if reference.endswith(".toml") and file.profile.name != Path(reference).stem:
         raise ConfigError(f"{reference}: 'name' must equal the file's name, found '{file.profile.name}'")
@@ -70,10 +73,9 @@ def _check(reference: str) -> dict[str, Any] | None:
     path = drivers.recording_path(file)
     if drivers.is_logged(path):
         return _logged(path)
-    sequence = read(path)
-    if not drivers.is_recording(reference):  # a recording on its own need not have the sensors of the shipped profile
-        check_sensors(sequence, spec)
-    return {"path": path, **describe(sequence)}
+    motion = read(path)
+    check_sensors(motion, spec)
+    return {"path": path, **describe(motion)}
 
 
 def _logged(reference: str) -> dict[str, Any]:

@@ -16,6 +16,16 @@ from trainer.profile import Profile, ProfileFile, load_profile, parse_profile
 __all__ = ["Driver", "is_logged", "is_recording", "open_driver", "open_profile", "recording_path"]
 
 
+#: By the end of a recording's name: the shipped profile that plays it; None where sensors have no usual names.
+PLAYED_BY: dict[str, str | None] = {
+    ".mha": "plus-sequence",
+    ".nrrd": "plus-sequence",
+    ".txt": "jigsaws",
+    ".csv": "pose-table",
+    ".xml": None,
+}
+
+
 def is_logged(reference: str) -> bool:
     """Whether ``reference`` is ``PATH.db#SESSION``, a session of our own log."""
     db, separator, session = reference.rpartition("#")
@@ -23,8 +33,8 @@ def is_logged(reference: str) -> bool:
 
 
 def is_recording(reference: str) -> bool:
-    """Whether ``reference`` names a recording (``*.mha``, ``PATH.db#SESSION``) and not a profile."""
-    return reference.endswith(".mha") or is_logged(reference)
+    """Whether ``reference`` names a recording (``*.mha``, ``*.csv`` …, ``PATH.db#SESSION``) and not a profile."""
+    return Path(reference).suffix.lower() in PLAYED_BY or is_logged(reference)
 
 
 def open_profile(reference: str) -> ProfileFile:
@@ -34,7 +44,11 @@ def open_profile(reference: str) -> ProfileFile:
     """
     if not is_recording(reference):
         return load_profile(reference)
-    name = "logged-session" if is_logged(reference) else "plus-sequence"
+    name = "logged-session" if is_logged(reference) else PLAYED_BY[Path(reference).suffix.lower()]
+    if name is None:
+        raise ConfigError(
+            f"{reference}: which of its sensors moves what? Write a profile that says so (devices/README.md)"
+        )
     template = config.read_text(data_folder("devices") / f"{name}.toml")
     text = template.replace('path = ""', f"path = {json.dumps(reference, ensure_ascii=False)}", 1)
     return ProfileFile(path=reference, text=text, profile=parse_profile(text, reference))

@@ -13,6 +13,9 @@ that was is held (before the first, that one).
 **Mapping.** ``world_from_tool = anchor · scene_from_device · (scale · position, rotation) · sensor_from_tool``.
 With ``anchor = "home"`` each instrument has its own anchor, which moves its first OK sample, rotation too,
 onto the pose in which the task has it wait. An instrument without a sensor stays there.
+
+**Jaws.** Closure as recorded, or from the recorded angle between the two at which the profile says that the jaws are
+open and closed; where the file knows of neither, the profile's constant ``closure``.
 """
 
 from __future__ import annotations
@@ -23,8 +26,7 @@ from pathlib import Path
 import numpy as np
 
 from trainer.config import ConfigError
-from trainer.drivers import sequence_file
-from trainer.drivers.sequence_file import SequenceFile, Track
+from trainer.drivers import motion_file
 from trainer.geometry import (
     Array,
     Rigid,
@@ -33,31 +35,32 @@ from trainer.geometry import (
     quaternion_multiply,
     slerp,
 )
+from trainer.motion import Motion, Track
 from trainer.poses import ToolPoses
 from trainer.profile import RecordingSpec, Sensor
 
 
 class Recording:
-    """Driver that plays a sequence file; everything is computed when it is opened."""
+    """Driver that plays a recorded motion; everything is computed when it is opened."""
 
     def __init__(self, path: Path, spec: RecordingSpec, tools: Sequence[str], tick_hz: float, home: ToolPoses) -> None:
         """``tools`` are the task's instruments in the order of ``home``. Raises ConfigError."""
-        self._sequence = sequence_file.read(path)
-        check_sensors(self._sequence, spec)
-        self._time = tick_times(self._sequence, tick_hz)
-        self._end = neighbours(self._sequence.time, self._time)[1]
+        self._motion = motion_file.read(path)
+        check_sensors(self._motion, spec)
+        self._time = tick_times(self._motion, tick_hz)
+        self._end = neighbours(self._motion.time, self._time)[1]
         ticks = len(self._time)
         self._position = np.tile(home.position, (ticks, 1, 1))
         self._quaternion = np.tile(home.quaternion, (ticks, 1, 1))
         self._valid = np.tile(np.asarray(home.valid, dtype=bool), (ticks, 1))
-        self._closure = home.closure.copy()
+        self._closure = np.tile(home.closure, (ticks, 1))
         self._sensors: dict[str, str] = {}
         for sensor in spec.sensor:
             if sensor.tool not in tools:
                 continue
             k = tools.index(sensor.tool)
-            track = self._sequence.track(sensor.name)
-            sampled = resample(self._sequence, track, self._time, tick_hz)
+            track = self._motion.track(sensor.name)
+            sampled = resample(self._motion, track, self._time, tick_hz)
             first = int(np.argmax(track.ok))
             start = map_poses(track.position[first], track.quaternion[first], spec, sensor)
             anchor = Rigid.identity()
@@ -66,27 +69,27 @@ class Recording:
             mapped = _compose(anchor, *map_poses(sampled[0], sampled[1], spec, sensor))
             self._position[:, k], self._quaternion[:, k] = mapped
             self._valid[:, k] = sampled[2]
-            self._closure[k] = sensor.closure
+            self._closure[:, k] = resample_jaws(self._motion, track, sensor, self._time)
             self._sensors[sensor.tool] = sensor.name
         self._consumed = 0
 
     def poll(self, tick: int, view: object) -> ToolPoses | None:
         if tick >= len(self._time):
-            self._consumed = len(self._sequence.time)
+            self._consumed = len(self._motion.time)
             return None
         self._consumed = int(self._end[tick]) + 1
-        return ToolPoses(self._position[tick], self._quaternion[tick], self._closure, self._valid[tick])
+        return ToolPoses(self._position[tick], self._quaternion[tick], self._closure[tick], self._valid[tick])
 
     def summary(self) -> dict[str, object]:
         """Counts of the whole file and, as ``frames_consumed``, how many of its frames were played."""
         return {
             "driver": "recording",
-            "path": self._sequence.path,
-            "frames": len(self._sequence.time),
+            "path": self._motion.path,
+            "frames": len(self._motion.time),
             "frames_consumed": self._consumed,
-            "gaps": self._sequence.gaps,
-            "missing_frames": self._sequence.missing_frames,
-            "duration_s": self._sequence.duration_s,
+            "gaps": self._motion.gaps,
+            "missing_frames": self._motion.missing_frames,
+            "duration_s": self._motion.duration_s,
             "sensors": self._sensors,
         }
 
@@ -94,22 +97,22 @@ class Recording:
         """Nothing stays open."""
 
 
-def check_sensors(sequence: SequenceFile, spec: RecordingSpec) -> None:
+def check_sensors(motion: Motion, spec: RecordingSpec) -> None:
     """Raises ConfigError when the profile's sensors do not fit the file or each other."""
     if not spec.sensor:
-        raise ConfigError(f"{sequence.path}: the profile names no sensor; add [[recording.sensor]]")
+        raise ConfigError(f"{motion.path}: the profile names no sensor; add [[recording.sensor]]")
     tools = [sensor.tool for sensor in spec.sensor]
     for sensor in spec.sensor:
         if tools.count(sensor.tool) > 1:
-            raise ConfigError(f"{sequence.path}: the profile maps two sensors to the instrument '{sensor.tool}'")
-        if not sequence.track(sensor.name).ok.any():
-            raise ConfigError(f"{sequence.path}: sensor '{sensor.name}' is not OK in any frame")
+            raise ConfigError(f"{motion.path}: the profile maps two sensors to the instrument '{sensor.tool}'")
+        if not motion.track(sensor.name).ok.any():
+            raise ConfigError(f"{motion.path}: sensor '{sensor.name}' is not OK in any frame")
 
 
-def tick_times(sequence: SequenceFile, tick_hz: float) -> Array:
+def tick_times(motion: Motion, tick_hz: float) -> Array:
     """Times (m,) s from the first sample of all ticks up to the last sample."""
     # A millionth of a tick decides that a last tick at the very time of the last sample is one.
-    return np.arange(int(np.floor(sequence.duration_s * tick_hz + 1e-6)) + 1) / tick_hz
+    return np.arange(int(np.floor(motion.duration_s * tick_hz + 1e-6)) + 1) / tick_hz
 
 
 def neighbours(sample_time: Array, time: Array) -> tuple[np.ndarray, np.ndarray, Array]:
@@ -124,9 +127,9 @@ def neighbours(sample_time: Array, time: Array) -> tuple[np.ndarray, np.ndarray,
     return before, after, np.clip(fraction, 0.0, 1.0)
 
 
-def resample(sequence: SequenceFile, track: Track, time: Array, tick_hz: float) -> tuple[Array, Array, np.ndarray]:
+def resample(motion: Motion, track: Track, time: Array, tick_hz: float) -> tuple[Array, Array, np.ndarray]:
     """Position (m, 3), quaternion (m, 4) and validity (m,) of one sensor at ``time`` (m,), as the module says."""
-    before, after, fraction = neighbours(sequence.time, time)
+    before, after, fraction = neighbours(motion.time, time)
     ok = track.ok
     held = np.maximum.accumulate(np.where(ok, np.arange(len(ok)), int(np.argmax(ok))))
     a, b = held[before], held[after]
@@ -134,10 +137,23 @@ def resample(sequence: SequenceFile, track: Track, time: Array, tick_hz: float) 
     quaternion = slerp(track.quaternion[a], track.quaternion[b], fraction)
 
     seen = (ok[before] | (fraction == 1.0)) & (ok[after] | (fraction == 0.0))
-    t = sequence.time - sequence.time[0]
+    t = motion.time - motion.time[0]
     near = np.minimum(np.abs(time - t[before]), np.abs(t[after] - time)) <= 0.5 / tick_hz
-    skipped = sequence.frame_number[after] - sequence.frame_number[before] > 1
+    skipped = motion.frame_number[after] - motion.frame_number[before] > 1
     return position, quaternion, seen & (near | ~skipped)
+
+
+def resample_jaws(motion: Motion, track: Track, sensor: Sensor, time: Array) -> Array:
+    """Closure (m,) at ``time`` (m,), linear between samples; the profile's, where the recording knows of no jaws."""
+    if track.closure is not None:
+        recorded = track.closure
+    elif track.jaw_angle is not None and sensor.jaw_open_deg is not None and sensor.jaw_closed_deg is not None:
+        wide = np.degrees(track.jaw_angle) - sensor.jaw_closed_deg
+        recorded = 1.0 - wide / (sensor.jaw_open_deg - sensor.jaw_closed_deg)
+    else:
+        return np.full(len(time), sensor.closure)
+    before, after, fraction = neighbours(motion.time, time)
+    return np.asarray(np.clip((1.0 - fraction) * recorded[before] + fraction * recorded[after], 0.0, 1.0))
 
 
 def map_poses(position: Array, quaternion: Array, spec: RecordingSpec, sensor: Sensor) -> tuple[Array, Array]:

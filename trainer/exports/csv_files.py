@@ -8,19 +8,15 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 from trainer.curriculum import parse_task
 from trainer.events import payload
+from trainer.exports.files import close, make_room, naming
 from trainer.log.record import SessionRecord
 from trainer.metrics import score
-
-
-class ExportError(ValueError):
-    """An export that cannot be written; one line with the folder and the fix."""
-
 
 SESSIONS = (
     "session", "trainee", "task", "task_sha256", "device", "seed", "started_at", "status", "outcome", "ticks",
@@ -80,38 +76,19 @@ def write(records: Iterable[SessionRecord], folder: Path) -> dict[str, int]:
     Records are taken one at a time. Raises ExportError where the folder holds something or is a file,
     OSError where it cannot be written.
     """
-    if folder.exists() and not folder.is_dir():
-        raise ExportError(f"{folder}: is a file; name a folder with --out")
-    if folder.is_dir() and any(folder.iterdir()):
-        raise ExportError(f"{folder}: is not empty; nothing is overwritten, name a new folder with --out")
-    folder.mkdir(parents=True, exist_ok=True)
+    make_room(folder)
     rows = dict.fromkeys(FILES, 0)
     with ExitStack() as stack:
         writers = {}
         for name, (columns, _) in FILES.items():
             file = (folder / name).open("w", encoding="utf-8", newline="")
-            stack.callback(_close, file, folder / name)
+            stack.callback(close, file, folder / name)
             writers[name] = csv.writer(file, lineterminator="\n")
             writers[name].writerow(columns)
         for record in records:
             for name, (_, rows_of) in FILES.items():
-                with _naming(folder / name):
+                with naming(folder / name):
                     for row in rows_of(record):
                         writers[name].writerow(row)
                         rows[name] += 1
     return rows
-
-
-def _close(file: TextIO, path: Path) -> None:
-    with _naming(path):
-        file.close()
-
-
-@contextmanager
-def _naming(path: Path) -> Iterator[None]:
-    """Have an error name the file: a full disk names none."""
-    try:
-        yield
-    except OSError as error:
-        error.filename = str(path)
-        raise

@@ -1,0 +1,137 @@
+"""What is written is read again bit for bit, in both formats; nothing is overwritten."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from tests.drivers.format_samples import SAMPLES, put
+from tests.metrics.synthetic_session import performed
+from trainer.drivers import motion_file
+from trainer.exports.csv_files import write as write_csv
+from trainer.exports.files import ExportError
+from trainer.exports.motion_files import WRITERS, of_session, write_sequence, write_table
+from trainer.geometry import Array
+from trainer.motion import Motion, Track
+
+REAL = Path(__file__).parents[3] / "shared/data/tracker/WaterTankBottomTranslationTrackerBuffer.igs.mha"
+each_writer = pytest.mark.parametrize("end", WRITERS)
+
+
+def same(a: Array | None, b: Array | None) -> bool:
+    """Bit for bit: 0.0 is not -0.0."""
+    return a is b or (a is not None and b is not None and a.tobytes() == b.tobytes())
+
+
+def assert_same_motion(a: Motion, b: Motion) -> None:
+    assert same(a.time, b.time)
+    assert a.frame_number.tolist() == b.frame_number.tolist()
+    assert len(a.tracks) == len(b.tracks)
+    for x, y in zip(a.tracks.values(), b.tracks.values(), strict=True):
+        assert x.ok.tolist() == y.ok.tolist()
+        assert same(x.position[x.ok], y.position[y.ok])
+        assert same(x.quaternion[x.ok], y.quaternion[y.ok])
+        assert same(x.closure, y.closure)
+        assert same(x.jaw_angle, y.jaw_angle)
+
+
+@each_writer
+@pytest.mark.parametrize("start", SAMPLES)
+def test_a_recording_of_any_format_comes_back_exactly(end: str, start: str, tmp_path: Path) -> None:
+    content, sensor = SAMPLES[start]
+    motion = motion_file.read(put(tmp_path, start, content))
+    path = tmp_path / f"again{end}"
+    WRITERS[end](motion, path)
+    again = motion_file.read(path)
+    assert_same_motion(motion, again)
+    again.track(sensor)  # found by its name
+
+
+@st.composite
+def motions(draw: st.DrawFn) -> Motion:
+    """Poses with all their digits, times that may be equal, gaps, sensors with and without jaws, unseen samples."""
+    n = draw(st.integers(1, 6))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    number = st.floats(-1e5, 1e5, allow_subnormal=True)
+    tracks = {}
+    for name in ("left", "ProbeToTracker"):
+        quaternion = rng.normal(size=(n, 4))
+        quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
+        tracks[name] = Track(
+            np.array(draw(st.lists(number, min_size=3 * n, max_size=3 * n))).reshape(n, 3),
+            quaternion,
+            np.array(draw(st.lists(st.booleans(), min_size=n, max_size=n))),
+            rng.uniform(size=n) if draw(st.booleans()) else None,
+            rng.normal(size=n) if draw(st.booleans()) else None,
+        )
+    time = np.sort(np.array(draw(st.lists(st.floats(0, 1e10), min_size=n, max_size=n))))
+    return Motion("made", time, np.cumsum(rng.integers(0, 4, n)), tracks)
+
+
+@each_writer
+@settings(deadline=None, max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(motion=motions())
+def test_any_motion_comes_back_bit_for_bit(end: str, tmp_path: Path, motion: Motion) -> None:
+    path = tmp_path / f"any{end}"
+    path.unlink(missing_ok=True)
+    WRITERS[end](motion, path)
+    assert_same_motion(motion, motion_file.read(path))
+
+
+@each_writer
+def test_a_session_comes_back_exactly(end: str, tmp_path: Path) -> None:
+    session = performed(seed=3)
+    motion = of_session(session)
+    path = tmp_path / f"session{end}"
+    WRITERS[end](motion, path)
+    again = motion_file.read(path)
+    assert_same_motion(motion, again)
+    for k, tool in enumerate(session.header.tools):
+        assert same(again.track(tool).position, np.ascontiguousarray(session.position[:, k]))
+        assert same(again.track(tool).closure, np.ascontiguousarray(session.closure[:, k]))
+
+
+def test_the_poses_that_the_csv_export_writes_are_a_recording(tmp_path: Path) -> None:
+    session = performed(seed=4)
+    write_csv([session], tmp_path / "out")
+    assert_same_motion(of_session(session), motion_file.read(tmp_path / "out" / "poses.csv"))
+
+
+def test_a_sequence_file_has_what_its_readers_look_for(tmp_path: Path) -> None:
+    """Keys as PLUS writes them; a sensor's name has a reference; all 16 numbers of a pose; frames without pictures."""
+    motion = of_session(performed(seed=5))
+    n = write_sequence(motion, tmp_path / "a.igs.mha")
+    text = (tmp_path / "a.igs.mha").read_text()
+    assert f"DimSize = 0 0 {n}\n" in text
+    assert text.endswith("ElementDataFile = LOCAL\n")
+    for tool in ("left", "right"):
+        rows = re.findall(rf"^Seq_Frame\d{{4}}_{tool}ToReferenceTransform = (.*)$", text, flags=re.MULTILINE)
+        assert len(rows) == n
+        assert {len(row.split()) for row in rows} == {16}
+        assert text.count(f"_{tool}ToReferenceTransformStatus = OK") == n
+
+
+@pytest.mark.parametrize("write", [write_sequence, write_table])
+def test_nothing_is_overwritten(tmp_path: Path, write: Callable[[Motion, Path], int]) -> None:
+    path = tmp_path / "a"
+    path.write_text("mine")
+    with pytest.raises(ExportError, match="exists already; nothing is overwritten"):
+        write(of_session(performed()), path)
+    assert path.read_text() == "mine"
+
+
+@pytest.mark.skipif(not REAL.exists(), reason=f"the real recording {REAL.name} is not beside the checkout")
+@each_writer
+def test_the_real_recording_comes_back_exactly(end: str, tmp_path: Path) -> None:
+    motion = motion_file.read(REAL)
+    path = tmp_path / f"real{end}"
+    WRITERS[end](motion, path)
+    again = motion_file.read(path)
+    assert_same_motion(motion, again)
+    assert (again.gaps, again.sensors) == (614, ["Probe", "Reference", "Stylus"])
