@@ -1,13 +1,19 @@
-"""Device profiles: which driver moves the instruments, and how what it sees maps to them."""
+"""Device profiles: which driver moves the instruments, and how what it sees maps to them.
+
+Beside a profile there may be calibrations (:mod:`trainer.calibration`). Loading the profile appends the text of the
+newest, or of the one that ``calibrated_by`` names, and puts its numbers in the place of the profile's own; so the text
+that a session stores says all.
+"""
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
-from trainer import config
+from trainer import calibration, config
+from trainer.calibration import Calibration, Distortion
 from trainer.config import ANGLE_DEG, POSITION_MM, Bounds, ConfigError
 from trainer.data_files import data_folder
 
@@ -61,6 +67,7 @@ class RecordingSpec:
     position_mm: Vector = field(default=(0.0, 0.0, 0.0), metadata=POSITION_MM)
     rotation_deg: Vector = field(default=(0.0, 0.0, 0.0), metadata=ANGLE_DEG)  # about x, then y, then z
     anchor: Literal["home", "none"] = "none"  # home: the first sample of a tool is where the task has it wait
+    distortion: Distortion | None = None  # of the tracker's field; usually from a calibration
 
 
 @dataclass(frozen=True)
@@ -72,6 +79,8 @@ class Profile:
     summary: str
     hand: Hand | None = None
     recording: RecordingSpec | None = None
+    calibrated_by: str = "newest"  # of the calibrations beside the file; or the name of one of them, or "none"
+    calibration: Calibration | None = None  # whose numbers are in effect
 
     def __post_init__(self) -> None:
         wanted = {"scripted": "hand", "recording": "recording"}[self.driver]
@@ -93,22 +102,65 @@ class ProfileFile:
 
 
 def parse_profile(text: str, name: str) -> Profile:
-    """The profile in a TOML text. Raises ConfigError."""
-    return config.build(Profile, config.parse_toml(text, name), name)
+    """The profile in a TOML text, with its calibration in effect. Raises ConfigError."""
+    return _calibrated(config.build(Profile, config.parse_toml(text, name), name), name)
+
+
+def _calibrated(profile: Profile, name: str) -> Profile:
+    """The profile with what was measured in the place of what it states itself."""
+    measured, spec = profile.calibration, profile.recording
+    if measured is None or spec is None:
+        return profile
+    tips = {tip.sensor: tip.position_mm for tip in measured.tip}
+    for sensor in tips:
+        if sensor not in [s.name for s in spec.sensor]:
+            raise ConfigError(f"{name}: the calibration is of a sensor '{sensor}', which the profile does not have")
+    spec = replace(spec, sensor=tuple(replace(s, position_mm=tips.get(s.name, s.position_mm)) for s in spec.sensor))
+    if measured.scene is not None:
+        spec = replace(spec, position_mm=measured.scene.position_mm, rotation_deg=measured.scene.rotation_deg)
+    if measured.distortion is not None:
+        spec = replace(spec, distortion=measured.distortion)
+    return replace(profile, recording=spec)
 
 
 def profile_names() -> list[str]:
-    """Names of the shipped profiles, sorted."""
-    return sorted(p.stem for p in data_folder("devices").glob("*.toml"))
+    """Names of the shipped profiles, sorted; a name with a dot in it is that of a calibration."""
+    return sorted(p.stem for p in data_folder("devices").glob("*.toml") if "." not in p.stem)
+
+
+def profile_path(reference: str) -> Path:
+    """The file of a shipped profile's name, or of the path of a profile's TOML. Raises ConfigError."""
+    if reference.endswith(".toml"):
+        return Path(reference)
+    if reference in profile_names():
+        return data_folder("devices") / f"{reference}.toml"
+    raise ConfigError(f"unknown device profile '{reference}'; known: {', '.join(profile_names())}")
 
 
 def load_profile(reference: str) -> ProfileFile:
-    """A shipped profile's name or the path of a profile's TOML. Raises ConfigError."""
-    if reference.endswith(".toml"):
-        path = Path(reference)
-    elif reference in profile_names():
-        path = data_folder("devices") / f"{reference}.toml"
-    else:
-        raise ConfigError(f"unknown device profile '{reference}'; known: {', '.join(profile_names())}")
+    """A shipped profile's name or the path of a profile's TOML, with its calibration. Raises ConfigError."""
+    path = profile_path(reference)
     text = config.read_text(path)
-    return ProfileFile(path=reference, text=text, profile=parse_profile(text, str(path)))
+    profile = parse_profile(text, str(path))
+    chosen = _calibration_of(profile, path)
+    if chosen is not None and profile.calibration is None:
+        addition = config.read_text(chosen)
+        table = config.parse_toml(addition, str(chosen)).get("calibration")
+        config.build(Calibration, table, str(chosen), "calibration")  # so that a fault is told of this file
+        text = f"{text.rstrip()}\n\n# {chosen.name}\n{addition}"
+        profile = parse_profile(text, str(path))
+    return ProfileFile(path=reference, text=text, profile=profile)
+
+
+def _calibration_of(profile: Profile, path: Path) -> Path | None:
+    """The file of the calibration that a profile goes by; None where there is none."""
+    if profile.calibrated_by == "none":
+        return None
+    found = calibration.beside(path)
+    if profile.calibrated_by == "newest":
+        return found[-1] if found else None
+    named = path.with_name(profile.calibrated_by)
+    if named not in found:
+        known = ", ".join(p.name for p in found) or "there is none"
+        raise ConfigError(f"{path}: no calibration '{profile.calibrated_by}' beside it; known: {known}")
+    return named

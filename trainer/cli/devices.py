@@ -114,3 +114,34 @@ def _print_recording(recording: dict[str, Any]) -> None:
         if sensor["low_mm"] is not None:
             for axis, low, high in zip("xyz", sensor["low_mm"], sensor["high_mm"], strict=True):
                 print(f"  {axis} {low:.2f} to {high:.2f} mm")
+
+
+@app.command()
+def calibrate(
+    profile: Annotated[str, typer.Argument(metavar="PROFILE", help="A profile's .toml file, or its name.")],
+    points: Annotated[Path | None, typer.Option(metavar="FILE", help="CSV: readings at known points.")] = None,
+    sweep: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Recording: the tip rests, the tool turns.")
+    ] = None,
+    grid: Annotated[Path | None, typer.Option(metavar="FILE", help="CSV: readings all over the field.")] = None,
+    sensor: Annotated[str | None, typer.Option(metavar="NAME", help="The sensor, where there are several.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Fit where the scene is, where the tip is and how the field is bent; keep it in a dated file beside the profile."""
+    from trainer.cli.calibrate import calibrate_from_files
+
+    calibrate_from_files(profile, points, sweep, grid, sensor, as_json)
+
+
+@app.command()
+def monitor(
+    profile: Annotated[
+        str, typer.Argument(metavar="PROFILE", help="A profile's .toml file, its name, or a recording.")
+    ],
+    seconds: Annotated[float | None, typer.Option(min=0.1, metavar="N", help="Only so long.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Show how the device's records arrive: rate, jitter, loss, poses, closure and the age of the calibration."""
+    from trainer.cli.monitor import show_recording
+
+    show_recording(profile, seconds, as_json)

@@ -5,10 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from trainer import config
 from trainer.config import ConfigError
 from trainer.curriculum import Task
-from trainer.data_files import data_folder
 from trainer.drivers.driver import Driver
 from trainer.poses import ToolPoses
 from trainer.profile import Profile, ProfileFile, load_profile, parse_profile
@@ -49,8 +47,8 @@ def open_profile(reference: str) -> ProfileFile:
         raise ConfigError(
             f"{reference}: which of its sensors moves what? Write a profile that says so (devices/README.md)"
         )
-    template = config.read_text(data_folder("devices") / f"{name}.toml")
-    text = template.replace('path = ""', f"path = {json.dumps(reference, ensure_ascii=False)}", 1)
+    template = load_profile(name)
+    text = template.text.replace('path = ""', f"path = {json.dumps(reference, ensure_ascii=False)}", 1)
     return ProfileFile(path=reference, text=text, profile=parse_profile(text, reference))
 
 

@@ -10,7 +10,8 @@ of it. So every gap of at least two ticks (20 ms at 100 Hz) is lost and found ag
 sample alone stands between two gaps. Poses stay finite throughout: where a sample is not OK the last one
 that was is held (before the first, that one).
 
-**Mapping.** ``world_from_tool = anchor · scene_from_device · (scale · position, rotation) · sensor_from_tool``.
+**Mapping.** ``world_from_tool = anchor · scene_from_device · (scale · position, rotation) · sensor_from_tool``, where a
+calibration corrects the position first (:mod:`trainer.drivers.field_distortion`).
 With ``anchor = "home"`` each instrument has its own anchor, which moves its first OK sample, rotation too,
 onto the pose in which the task has it wait. An instrument without a sensor stays there.
 
@@ -27,6 +28,7 @@ import numpy as np
 
 from trainer.config import ConfigError
 from trainer.drivers import motion_file
+from trainer.drivers.field_distortion import correct
 from trainer.geometry import (
     Array,
     Rigid,
@@ -143,22 +145,29 @@ def resample(motion: Motion, track: Track, time: Array, tick_hz: float) -> tuple
     return position, quaternion, seen & (near | ~skipped)
 
 
+def recorded_closure(track: Track, sensor: Sensor) -> Array | None:
+    """Closure (n,) of each sample, 0 open … 1 closed; None where the recording or the profile knows of no jaws."""
+    if track.closure is not None:
+        return np.asarray(np.clip(track.closure, 0.0, 1.0))
+    if track.jaw_angle is None or sensor.jaw_open_deg is None or sensor.jaw_closed_deg is None:
+        return None
+    wide = np.degrees(track.jaw_angle) - sensor.jaw_closed_deg
+    return np.asarray(np.clip(1.0 - wide / (sensor.jaw_open_deg - sensor.jaw_closed_deg), 0.0, 1.0))
+
+
 def resample_jaws(motion: Motion, track: Track, sensor: Sensor, time: Array) -> Array:
     """Closure (m,) at ``time`` (m,), linear between samples; the profile's, where the recording knows of no jaws."""
-    if track.closure is not None:
-        recorded = track.closure
-    elif track.jaw_angle is not None and sensor.jaw_open_deg is not None and sensor.jaw_closed_deg is not None:
-        wide = np.degrees(track.jaw_angle) - sensor.jaw_closed_deg
-        recorded = 1.0 - wide / (sensor.jaw_open_deg - sensor.jaw_closed_deg)
-    else:
+    recorded = recorded_closure(track, sensor)
+    if recorded is None:
         return np.full(len(time), sensor.closure)
     before, after, fraction = neighbours(motion.time, time)
-    return np.asarray(np.clip((1.0 - fraction) * recorded[before] + fraction * recorded[after], 0.0, 1.0))
+    return np.asarray((1.0 - fraction) * recorded[before] + fraction * recorded[after])
 
 
 def map_poses(position: Array, quaternion: Array, spec: RecordingSpec, sensor: Sensor) -> tuple[Array, Array]:
     """Sensor poses ``(..., 3)``, ``(..., 4)`` in the device's frame as tool poses in the scene's, before the anchor."""
     scene_from_device = Rigid(np.array(spec.position_mm), quaternion_from_euler_deg(spec.rotation_deg))
+    position = correct(position, spec.distortion)
     offset = matrix_from_quaternion(quaternion) @ np.array(sensor.position_mm)
     turned = quaternion_multiply(quaternion, quaternion_from_euler_deg(sensor.rotation_deg))
     return _compose(scene_from_device, spec.scale * position + offset, turned)

@@ -1,0 +1,107 @@
+"""What ``trainer devices monitor`` shows: a table that is drawn anew while records arrive, or one JSON document."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import asdict
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from trainer.motion import Motion
+    from trainer.profile import Profile, RecordingSpec
+
+REDRAWN_EVERY_S = 0.25
+WINDOW_S = 2.0  # what the live table is about: the last seconds
+
+
+def show_recording(reference: str, seconds: float | None, as_json: bool) -> None:
+    """Play a recording at its own pace and show how its records arrive; ``--json`` does not wait for them.
+
+    Raises ConfigError for a device that plays no recording.
+    """
+    from trainer import drivers
+    from trainer.config import ConfigError
+    from trainer.drivers.motion_file import read
+    from trainer.drivers.recording import check_sensors
+
+    file = drivers.open_profile(reference)
+    profile, spec = file.profile, file.profile.recording
+    if spec is None or profile.driver != "recording" or drivers.is_logged(drivers.recording_path(file)):
+        raise ConfigError(f"device '{profile.name}' receives no records, so there is nothing to monitor")
+    motion = read(drivers.recording_path(file))
+    check_sensors(motion, spec)
+    end_s = motion.duration_s if seconds is None else min(seconds, motion.duration_s)
+    if as_json:
+        print(json.dumps(measured(motion, profile, spec, 0.0, end_s), indent=2))
+    else:
+        _play(motion, profile, spec, end_s)
+
+
+def measured(motion: Motion, profile: Profile, spec: RecordingSpec, start_s: float, end_s: float) -> dict[str, Any]:
+    """What the records between two times, s from the first, say; ready for JSON."""
+    import numpy as np
+
+    from trainer.drivers.monitor import arrival, seen
+    from trainer.drivers.recording import recorded_closure
+
+    t = motion.time - motion.time[0]
+    part = slice(int(np.searchsorted(t, start_s, side="left")), int(np.searchsorted(t, end_s, side="right")))
+    sensors = {}
+    for sensor in spec.sensor:
+        track = motion.track(sensor.name)
+        closure = recorded_closure(track, sensor)
+        found = seen(track.position[part], track.ok[part], None if closure is None else closure[part])
+        sensors[sensor.name] = {"tool": sensor.tool, **asdict(found)}
+    used = profile.calibration
+    return {
+        "device": profile.name,
+        "calibration": None if used is None else {"date": used.date, "age_s": used.age_s(datetime.now(UTC))},
+        **asdict(arrival(motion.time[part], motion.frame_number[part])),
+        "sensors": sensors,
+    }
+
+
+def _play(motion: Motion, profile: Profile, spec: RecordingSpec, end_s: float) -> None:
+    """Draw the table of the last seconds while they pass, and in the end that of all."""
+    from rich.live import Live
+
+    began = time.monotonic()
+    with Live(auto_refresh=False) as live:
+        now = 0.0
+        while now < end_s:
+            time.sleep(min(REDRAWN_EVERY_S, end_s - now))
+            now = min(time.monotonic() - began, end_s)
+            live.update(_table(measured(motion, profile, spec, now - WINDOW_S, now)), refresh=True)
+        live.update(_table(measured(motion, profile, spec, 0.0, end_s)), refresh=True)
+
+
+def _table(report: dict[str, Any]) -> Table:
+    from rich.table import Table
+
+    used = report["calibration"]
+    caption = "not calibrated" if used is None else f"calibrated {used['age_s'] / 3600.0:.1f} h ago"
+    table = Table(title=f"{report['device']}: {report['records']} records", caption=caption, caption_justify="left")
+    for column in ("", "seen", "x mm", "y mm", "z mm", "closure", "Hz", "jitter ms", "longest ms", "lost"):
+        table.add_column(column, justify="right" if column else "left")
+    table.add_row(
+        "all", "", "", "", "", "",
+        _text(report["rate_hz"], 1),
+        _text(report["jitter_ms"], 2),
+        _text(report["interval_max_ms"], 1),
+        "–" if report["lost"] is None else f"{report['lost']} ({report['loss_percent']:.1f} %)",
+    )  # fmt: skip
+    for name, sensor in report["sensors"].items():
+        place = sensor["position_mm"] or (None, None, None)
+        jaws = _text(sensor["closure"], 2)
+        table.add_row(
+            f"{name} ({sensor['tool']})", f"{sensor['seen_percent']:.1f} %", *(_text(v, 2) for v in place), jaws
+        )
+    return table
+
+
+def _text(value: float | None, digits: int) -> str:
+    return "–" if value is None else f"{value:.{digits}f}"
