@@ -25,18 +25,14 @@ def calibrate_from_files(
     if profile.calibrated_by != "newest":
         typer.echo(f"trainer: the profile goes by '{profile.calibrated_by}', not by this one", err=True)
     if grid is not None and profile.calibration is not None:
-        typer.echo(
-            "trainer: what was measured before the field was corrected is left out: tips and points anew", err=True
-        )
+        typer.echo("trainer: the field is corrected now; measure tips and points again", err=True)
     if as_json:
         print(json.dumps({"path": str(path), **asdict(found)}, indent=2))
         return
-    if grid is not None and found.distortion is not None:
-        d = found.distortion
-        print(f"field: polynomial of order {d.order}, {d.points} points")
-        print(
-            f"  residual on points held out: {d.residual_before_mm:.3f} mm before, {d.residual_after_mm:.3f} mm after"
-        )
+    field = found.distortion
+    if grid is not None and field is not None:
+        print(f"field: polynomial of order {field.order}, {field.points} points; residual on those held out of the fit")
+        print(f"  {field.residual_before_mm:.3f} mm before, {field.residual_after_mm:.3f} mm after")
     for tip in found.tip if sweep is not None else ():
         place = ", ".join(f"{v:.2f}" for v in tip.position_mm)
         print(f"tip of {tip.sensor}: ({place}) mm, sd {tip.uncertainty_mm:.3f} mm, {tip.poses} poses")

@@ -120,14 +120,12 @@ def _print_recording(recording: dict[str, Any]) -> None:
 def calibrate(
     profile: Annotated[str, typer.Argument(metavar="PROFILE", help="A profile's .toml file, or its name.")],
     points: Annotated[Path | None, typer.Option(metavar="FILE", help="CSV: readings at known points.")] = None,
-    sweep: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Recording: the tip rests, the tool turns.")
-    ] = None,
+    sweep: Annotated[Path | None, typer.Option(metavar="FILE", help="Recording: the tool turns on its tip.")] = None,
     grid: Annotated[Path | None, typer.Option(metavar="FILE", help="CSV: readings all over the field.")] = None,
     sensor: Annotated[str | None, typer.Option(metavar="NAME", help="The sensor, where there are several.")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Fit where the scene is, where the tip is and how the field is bent; keep it in a dated file beside the profile."""
+    """Fit where the scene is, where the tip is, how the field is bent; keep it in a dated file beside the profile."""
     from trainer.cli.calibrate import calibrate_from_files
 
     calibrate_from_files(profile, points, sweep, grid, sensor, as_json)
@@ -135,9 +133,7 @@ def calibrate(
 
 @app.command()
 def monitor(
-    profile: Annotated[
-        str, typer.Argument(metavar="PROFILE", help="A profile's .toml file, its name, or a recording.")
-    ],
+    profile: Annotated[str, typer.Argument(metavar="PROFILE", help="A profile's name or .toml, or a recording.")],
     seconds: Annotated[float | None, typer.Option(min=0.1, metavar="N", help="Only so long.")] = None,
     as_json: JsonOption = False,
 ) -> None:

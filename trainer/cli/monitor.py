@@ -67,39 +67,35 @@ def measured(motion: Motion, profile: Profile, spec: RecordingSpec, start_s: flo
 
 def _play(motion: Motion, profile: Profile, spec: RecordingSpec, end_s: float) -> None:
     """Draw the table of the last seconds while they pass, and in the end that of all."""
+    from rich.console import Console
     from rich.live import Live
 
     began = time.monotonic()
-    with Live(auto_refresh=False) as live:
+    with Live(auto_refresh=False, transient=True) as live:
         now = 0.0
         while now < end_s:
             time.sleep(min(REDRAWN_EVERY_S, end_s - now))
             now = min(time.monotonic() - began, end_s)
             live.update(_table(measured(motion, profile, spec, now - WINDOW_S, now)), refresh=True)
-        live.update(_table(measured(motion, profile, spec, 0.0, end_s)), refresh=True)
+    Console().print(_table(measured(motion, profile, spec, 0.0, end_s)))
 
 
 def _table(report: dict[str, Any]) -> Table:
     from rich.table import Table
 
     used = report["calibration"]
-    caption = "not calibrated" if used is None else f"calibrated {used['age_s'] / 3600.0:.1f} h ago"
-    table = Table(title=f"{report['device']}: {report['records']} records", caption=caption, caption_justify="left")
-    for column in ("", "seen", "x mm", "y mm", "z mm", "closure", "Hz", "jitter ms", "longest ms", "lost"):
-        table.add_column(column, justify="right" if column else "left")
-    table.add_row(
-        "all", "", "", "", "", "",
-        _text(report["rate_hz"], 1),
-        _text(report["jitter_ms"], 2),
-        _text(report["interval_max_ms"], 1),
-        "–" if report["lost"] is None else f"{report['lost']} ({report['loss_percent']:.1f} %)",
-    )  # fmt: skip
+    table = Table(
+        title=f"{report['device']}: {_text(report['rate_hz'], 1)} Hz, jitter {_text(report['jitter_ms'], 2)} ms, "
+        f"longest {_text(report['interval_max_ms'], 1)} ms, lost {report['lost']} ({_text(report['loss_percent'], 1)} %)",
+        caption="not calibrated" if used is None else f"calibrated {used['age_s'] / 3600.0:.1f} h ago",
+    )
+    table.add_column("sensor")
+    for column in ("seen %", "x mm", "y mm", "z mm", "closure"):
+        table.add_column(column, justify="right")
     for name, sensor in report["sensors"].items():
         place = sensor["position_mm"] or (None, None, None)
-        jaws = _text(sensor["closure"], 2)
-        table.add_row(
-            f"{name} ({sensor['tool']})", f"{sensor['seen_percent']:.1f} %", *(_text(v, 2) for v in place), jaws
-        )
+        numbers = (_text(v, 2) for v in (*place, sensor["closure"]))
+        table.add_row(f"{name} ({sensor['tool']})", f"{sensor['seen_percent']:.1f}", *numbers)
     return table
 
 
