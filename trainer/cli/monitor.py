@@ -84,11 +84,11 @@ def _table(report: dict[str, Any]) -> Table:
     from rich.table import Table
 
     used = report["calibration"]
-    table = Table(
-        title=f"{report['device']}: {_text(report['rate_hz'], 1)} Hz, jitter {_text(report['jitter_ms'], 2)} ms, "
-        f"longest {_text(report['interval_max_ms'], 1)} ms, lost {report['lost']} ({_text(report['loss_percent'], 1)} %)",
-        caption="not calibrated" if used is None else f"calibrated {used['age_s'] / 3600.0:.1f} h ago",
-    )
+    calibrated = "not calibrated" if used is None else f"calibrated {used['age_s'] / 3600.0:.1f} h ago"
+    pace = f"{_text(report['rate_hz'], 1)} Hz, jitter {_text(report['jitter_ms'], 2)} ms"
+    lost = f"lost {report['lost']} ({_text(report['loss_percent'], 1)} %)"
+    caption = f"{pace}, longest {_text(report['interval_max_ms'], 1)} ms, {lost}\n{calibrated}"
+    table = Table(title=report["device"], caption=caption)
     table.add_column("sensor")
     for column in ("seen %", "x mm", "y mm", "z mm", "closure"):
         table.add_column(column, justify="right")

@@ -5,8 +5,8 @@ position, by least squares. Where the grid stands is not known to the device, so
 rigidly over the measured ones; what is left over is the error.
 
 A fifth of the grid's points is held out of the fit, and the residual before and after is theirs. The order of the
-polynomial is that with the least residual on points left out by turns, among the others (5-fold cross-validation). What
-is stored is then fitted to all points. Orientations are not corrected.
+polynomial is the lowest that leaves hardly more than the least residual on points left out by turns, among the others
+(5-fold cross-validation). What is stored is then fitted to all points. Orientations are not corrected.
 """
 
 from __future__ import annotations
@@ -23,6 +23,11 @@ from trainer.geometry import Array
 ORDERS = (1, 2, 3, 4)  # beyond the fourth, a hand-made grid has too few points; assumed
 POINTS_A_TERM = 2  # of a fit, at the least; assumed
 FOLDS = 5
+FEWEST_POINTS = 12  # of the first order's 4 terms: 8 in four fifths of four fifths
+
+#: A higher order must leave less than this part of a lower one's residual; below a millionth of a millimetre, all are
+#: as good. Assumed.
+WORTH_A_HIGHER_ORDER = 0.95
 
 #: A grid whose spread along its shortest axis is less than this part of that along its longest is flat. Assumed.
 LEAST_HEIGHT = 0.1
@@ -61,15 +66,18 @@ def fit(measured: Array, known: Array) -> Distortion:
     held_out, others = shuffled[: n // FOLDS], shuffled[n // FOLDS :]
     allowed = [k for k in ORDERS if POINTS_A_TERM * _terms(k) <= len(others) * (FOLDS - 1) // FOLDS]
     if not allowed:
-        raise CalibrationError(f"the grid has {n} different points; a correction needs 13 or more")
+        raise CalibrationError(f"the grid has {n} different points; a correction needs {FEWEST_POINTS} or more")
     sizes = spread(known)
     if sizes[2] < LEAST_HEIGHT * sizes[0]:
         raise CalibrationError(
             f"the grid is flat: spread {sizes[0]:.1f} mm along its longest axis, {sizes[2]:.1f} mm along its shortest; "
             "measure it at several heights"
         )
-    order = min(allowed, key=lambda k: _residual_left_out(measured[others], known[others], k))
-    trial = _fit(measured[others], known[others], order)
+    low, high = measured.min(axis=0), measured.max(axis=0)
+    box = 0.5 * (low + high), 0.5 * (high - low)
+    left = {k: _residual_left_out(measured[others], known[others], k, box) for k in allowed}
+    order = next(k for k in allowed if WORTH_A_HIGHER_ORDER * left[k] <= min(left.values()) + 1e-6)
+    trial = _fit(measured[others], known[others], order, box)
     there = rigid(known[others], measured[others]).apply(known[held_out])
     before = _rms(measured[held_out] - there)
     after = _rms(correct(measured[held_out], trial) - there)
@@ -78,7 +86,7 @@ def fit(measured: Array, known: Array) -> Distortion:
             f"a correction does not help: on points held out of the fit the residual is {before:.3f} mm without it, "
             f"{after:.3f} mm with it; use none"
         )
-    whole = _fit(measured, known, order)
+    whole = _fit(measured, known, order, box)
     return Distortion(order, whole.centre_mm, whole.half_width_mm, whole.coefficient_mm, before, after, n)
 
 
@@ -86,9 +94,9 @@ def _terms(order: int) -> int:
     return (order + 1) * (order + 2) * (order + 3) // 6
 
 
-def _fit(measured: Array, known: Array, order: int) -> Distortion:
-    low, high = measured.min(axis=0), measured.max(axis=0)
-    centre, half = 0.5 * (low + high), 0.5 * (high - low)
+def _fit(measured: Array, known: Array, order: int, box: tuple[Array, Array]) -> Distortion:
+    """The correction in a ``box`` (centre, half width), its residuals left open."""
+    centre, half = box
     error = rigid(known, measured).apply(known) - measured
     table = monomials((measured - centre) / half, order)
     coefficients = np.linalg.lstsq(table, error, rcond=None)[0]
@@ -97,14 +105,14 @@ def _fit(measured: Array, known: Array, order: int) -> Distortion:
     return Distortion(order, (cx, cy, cz), (hx, hy, hz), rows, 0.0, 0.0, len(known))
 
 
-def _residual_left_out(measured: Array, known: Array, order: int) -> float:
+def _residual_left_out(measured: Array, known: Array, order: int, box: tuple[Array, Array]) -> float:
     """Residual of points that a fit has not seen, each left out once."""
     fold = np.arange(len(known)) % FOLDS
     errors = []
     for k in range(FOLDS):
         seen, left_out = fold != k, fold == k
         there = rigid(known[seen], measured[seen]).apply(known[left_out])
-        errors.append(correct(measured[left_out], _fit(measured[seen], known[seen], order)) - there)
+        errors.append(correct(measured[left_out], _fit(measured[seen], known[seen], order, box)) - there)
     return _rms(np.concatenate(errors))
 
 
