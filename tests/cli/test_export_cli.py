@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,21 @@ from tests.drivers.format_samples import FRAMES, SAMPLES, put
 from tests.log import log_samples
 from trainer.drivers import motion_file
 from trainer.log import reader
+from trainer.poses import ToolPoses
+
+SAMPLED = log_samples.poses
 
 
-def test_each_session_becomes_a_sequence_file(command_line: CommandLine, own_log: Path, tmp_path: Path) -> None:
+def turned(tick: int) -> ToolPoses:
+    """The samples' poses, with quaternions of length 1."""
+    poses = SAMPLED(tick)
+    return replace(poses, quaternion=poses.quaternion / np.linalg.norm(poses.quaternion, axis=1, keepdims=True))
+
+
+def test_each_session_becomes_a_sequence_file(
+    command_line: CommandLine, own_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(log_samples, "poses", turned)
     for session in ("20260101-a", "20260102-b"):
         log_samples.write(own_log, session)
     code, out, err = command_line("export", "igs-mha", "--out", tmp_path / "out", "--json")
