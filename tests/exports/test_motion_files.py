@@ -12,13 +12,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.drivers.format_samples import SAMPLES, put
-from tests.metrics.synthetic_session import performed
-from trainer.drivers import motion_file
+from tests.metrics.synthetic_session import performed, task_of
+from trainer.drivers import motion_file, open_driver
 from trainer.exports.csv_files import write as write_csv
 from trainer.exports.files import ExportError
 from trainer.exports.motion_files import WRITERS, of_session, write_sequence, write_table
-from trainer.geometry import Array
+from trainer.geometry import Array, matrix_from_quaternion
 from trainer.motion import Motion, Track
+from trainer.poses import ToolPoses
 
 REAL = Path(__file__).parents[3] / "shared/data/tracker/WaterTankBottomTranslationTrackerBuffer.igs.mha"
 each_writer = pytest.mark.parametrize("end", WRITERS)
@@ -75,7 +76,7 @@ def motions(draw: st.DrawFn) -> Motion:
 
 
 @each_writer
-@settings(deadline=None, max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(deadline=None, max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(motion=motions())
 def test_any_motion_comes_back_bit_for_bit(end: str, tmp_path: Path, motion: Motion) -> None:
     path = tmp_path / f"any{end}"
@@ -124,6 +125,45 @@ def test_nothing_is_overwritten(tmp_path: Path, write: Callable[[Motion, Path], 
     with pytest.raises(ExportError, match="exists already; nothing is overwritten"):
         write(of_session(performed()), path)
     assert path.read_text() == "mine"
+
+
+def test_a_sensor_that_a_key_cannot_name_is_refused_and_kept_in_a_table(tmp_path: Path) -> None:
+    text = "time_s,tool,x_mm,y_mm,z_mm,qw,qx,qy,qz\n0,left hand,1,2,3,1,0,0,0\n"
+    motion = motion_file.read(put(tmp_path, ".csv", text.encode()))
+    with pytest.raises(ExportError, match="cannot name a sensor 'left hand'"):
+        write_sequence(motion, tmp_path / "a.igs.mha")
+    assert not (tmp_path / "a.igs.mha").exists()
+    write_table(motion, tmp_path / "a.csv")
+    assert motion_file.read(tmp_path / "a.csv").sensors == ["left hand"]
+
+
+def test_a_session_s_table_moves_the_instruments_as_they_moved(tmp_path: Path) -> None:
+    """Tick upon tick, jaws and what was not seen included.
+
+    A tick's time and its sample's differ by the rounding of a time below 100 s, 1e-14, at speeds of 100 mm/s at most; a
+    rotation passes a slerp and two products.
+    """
+    session = performed(seed=6)
+    session.valid[7:9, 1] = False
+    write_csv([session], tmp_path / "out")
+    path = tmp_path / "out" / "poses.csv"
+    task = task_of()
+    tools = [instrument.tool for instrument in task.scene.instrument]
+    waiting = ToolPoses(np.zeros((2, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)), np.zeros(2), np.ones(2, dtype=bool))
+    _, driver = open_driver(str(path), task, waiting, seed=0)
+    columns = [session.header.tools.index(tool) for tool in tools]
+    played: list[ToolPoses] = []
+    while (poses := driver.poll(len(played), None)) is not None:
+        played.append(poses)
+    seen = session.valid[:, columns]
+    assert np.array_equal([poses.valid for poses in played], seen)
+    position = np.array([poses.position for poses in played])
+    turned = matrix_from_quaternion(np.array([poses.quaternion for poses in played]))
+    closure = np.array([poses.closure for poses in played])
+    np.testing.assert_allclose(position[seen], session.position[:, columns][seen], rtol=0, atol=1e-11)
+    wanted = matrix_from_quaternion(session.quaternion[:, columns])
+    np.testing.assert_allclose(turned[seen], wanted[seen], rtol=0, atol=1e-11)
+    np.testing.assert_allclose(closure, session.closure[:, columns], rtol=0, atol=1e-11)
 
 
 @pytest.mark.skipif(not REAL.exists(), reason=f"the real recording {REAL.name} is not beside the checkout")

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from trainer.exports.files import new_file
+from trainer.exports.files import ExportError, new_file
 from trainer.geometry import matrix_from_quaternion
 from trainer.log.record import SessionRecord
 from trainer.motion import Motion, Track
@@ -44,8 +44,12 @@ def of_session(record: SessionRecord) -> Motion:
 def write_sequence(motion: Motion, path: Path) -> int:
     """Write an ``.igs.mha`` file; returns its frames. Raises ExportError where the file exists, OSError.
 
-    A sensor without a reference in its name (``left``) gets one (``leftToReference``), as the format wants it.
+    A sensor without a reference in its name (``left``) gets one (``leftToReference``), as the format wants it. Raises
+    ExportError also for a name that the format's keys cannot hold.
     """
+    for name in motion.tracks:
+        if not re.fullmatch(r"\w+", name):
+            raise ExportError(f"{path}: a sequence file cannot name a sensor '{name}': letters and digits only")
     frames = [_sequence_frames(_with_reference(name), track) for name, track in motion.tracks.items()]
     with new_file(path) as file:
         file.write(HEADER.format(frames=len(motion.time)))
