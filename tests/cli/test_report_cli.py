@@ -12,7 +12,8 @@ from typer.testing import CliRunner
 
 from tests.metrics.synthetic_session import performed, task_of
 from trainer.cli import export, report
-from trainer.exports.csv_files import FILES, ExportError
+from trainer.exports.csv_files import FILES
+from trainer.exports.files import ExportError
 from trainer.log.record import SessionRecord
 from trainer.log.schema import LogError
 from trainer.metrics import score
