@@ -25,9 +25,9 @@ def read(path: str | Path) -> Motion:
     """The recording in a sequence file; the pictures are not read. Raises ConfigError, one line."""
     name = str(path)
     header, fields, data_bytes = _read_header(Path(path), name)
-    n = _dimensions(header, name)[-1]
-    motion = sequence_frames.motion(fields, n, "DimSize", name)
-    _check_pixels(header, data_bytes, name)
+    sizes = sequence_frames.sizes(header, "DimSize", name)
+    motion = sequence_frames.motion(fields, sizes[-1], "DimSize", name)
+    _check_pixels(header, sizes, data_bytes, name)
     return motion
 
 
@@ -54,32 +54,16 @@ def _read_header(path: Path, name: str) -> tuple[dict[str, str], Fields, int]:
     raise ConfigError(f"{name}: the header is cut short: no line 'ElementDataFile = …' at its end; copy the file again")
 
 
-def _dimensions(header: dict[str, str], name: str) -> list[int]:
-    try:
-        sizes = [int(s) for s in header["DimSize"].split()]
-    except KeyError:
-        raise ConfigError(f"{name}: the header has no 'DimSize'") from None
-    except ValueError:
-        sizes = []
-    if not sizes or min(sizes) < 0:
-        raise ConfigError(f"{name}: 'DimSize' expected whole numbers, found '{header['DimSize']}'")
-    return sizes
-
-
-def _check_pixels(header: dict[str, str], data_bytes: int, name: str) -> None:
+def _check_pixels(header: dict[str, str], sizes: list[int], data_bytes: int, name: str) -> None:
     """Compare the bytes behind the header with the pictures' size, where the header tells it.
 
     More bytes than needed are accepted: PLUS writes one for each frame of a recording without pictures.
     """
-    elements = math.prod(_dimensions(header, name))
+    elements = math.prod(sizes)
     if header["ElementDataFile"] != "LOCAL" or header.get("CompressedData", "False") == "True" or elements == 0:
         return
     kind = header.get("ElementType", "")
     channels = header.get("ElementNumberOfChannels", "1")
     if kind not in ELEMENT_BYTES or not channels.isdecimal():
         raise ConfigError(f"{name}: unknown 'ElementType = {kind}' of {channels} channels")
-    expected = elements * ELEMENT_BYTES[kind] * int(channels)
-    if data_bytes < expected:
-        raise ConfigError(
-            f"{name}: the pictures are cut short: {data_bytes} of {expected} bytes are there; copy the file again"
-        )
+    sequence_frames.check_length(data_bytes, elements * ELEMENT_BYTES[kind] * int(channels), name)

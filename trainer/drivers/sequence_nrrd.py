@@ -28,7 +28,7 @@ def read(path: str | Path) -> Motion:
     """The recording in a sequence file; the pictures are not read. Raises ConfigError, one line."""
     name = str(path)
     header, fields, data_bytes = _read_header(Path(path), name)
-    sizes = _sizes(header, name)
+    sizes = sequence_frames.sizes(header, "sizes", name)
     kinds = header.get("kinds", "").lower().split()
     axis = next((i for i, kind in enumerate(kinds) if kind in ("list", "time") and i < len(sizes)), -1)
     motion = sequence_frames.motion(fields, sizes[axis], "sizes", name)
@@ -63,18 +63,6 @@ def _read_header(path: Path, name: str) -> tuple[dict[str, str], Fields, int]:
     raise ConfigError(f"{name}: the header is cut short: no empty line at its end; copy the file again")
 
 
-def _sizes(header: dict[str, str], name: str) -> list[int]:
-    try:
-        sizes = [int(s) for s in header["sizes"].split()]
-    except KeyError:
-        raise ConfigError(f"{name}: the header has no 'sizes'") from None
-    except ValueError:
-        sizes = []
-    if not sizes or min(sizes) < 0:
-        raise ConfigError(f"{name}: 'sizes' expected whole numbers, found '{header['sizes']}'")
-    return sizes
-
-
 def _check_pixels(header: dict[str, str], sizes: list[int], data_bytes: int, name: str) -> None:
     """Compare the bytes behind the header with the pictures' size, where they are raw and in this file."""
     elements = math.prod(sizes)
@@ -85,8 +73,4 @@ def _check_pixels(header: dict[str, str], sizes: list[int], data_bytes: int, nam
     short = short.replace("long long", "longlong").removesuffix(" int")
     if short not in ELEMENT_BYTES:
         raise ConfigError(f"{name}: unknown 'type: {kind}'")
-    expected = elements * ELEMENT_BYTES[short]
-    if data_bytes < expected:
-        raise ConfigError(
-            f"{name}: the pictures are cut short: {data_bytes} of {expected} bytes are there; copy the file again"
-        )
+    sequence_frames.check_length(data_bytes, elements * ELEMENT_BYTES[short], name)
