@@ -11,6 +11,7 @@ from performing import one_drive, perform, record_of
 
 from trainer.curriculum import load_task
 from trainer.drivers.hand_motion import Tremor, along_arc, needle_pose
+from trainer.drivers.scripted import TURN
 from trainer.geometry import unit
 from trainer.metrics import score
 from trainer.profile import Hand
@@ -19,6 +20,19 @@ from trainer.profile import Hand
 COMMANDS = [
     (30.0 * hour, (50.0, 70.0, 90.0)[hour % 3], (0.20, 0.35, 0.50)[(hour // 3 + hour) % 3]) for hour in range(12)
 ]
+
+
+@pytest.mark.parametrize("wander_mm", [0.0, 1.5])
+def test_no_hand_leaps(wander_mm: float) -> None:
+    """Between two ticks an instrument goes no further than its speed, at the peak of a minimum-jerk movement (15/8 of
+    the mean), and its turning let it: what is turned lies within the needle's length of the jaws. A detour adds the
+    steepest part of sin² to a way that is given the time for it: pi/2 of its mean."""
+    task = load_task("anastomosis/single-stitch").task
+    hand = Hand(wander_mm=wander_mm)
+    at = np.array([p.position for p in perform(task, hand, seed=3).poses])
+    assert task.scene.needle is not None
+    fastest = 15.0 / 8.0 * (hand.speed_mm_s + TURN * task.scene.needle.length_mm) + math.pi / 2.0 * hand.speed_mm_s
+    assert np.linalg.norm(np.diff(at, axis=0), axis=2).max() < fastest / task.tick_hz
 
 
 def turned_apart(a_deg: float, b_deg: float) -> float:

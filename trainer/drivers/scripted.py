@@ -16,7 +16,7 @@ import numpy as np
 from trainer.curriculum import Step, Task
 from trainer.drivers.hand_motion import Tremor, along_arc, between, ease, needle_pose, round_vessel, turn_angle
 from trainer.drivers.sight import Lost, Sight, steepest_from_lumen
-from trainer.geometry import Array, Rigid, quaternion_from_axes, unit
+from trainer.geometry import Array, Rigid, quaternion_from_axes, slerp, unit
 from trainer.poses import ToolPoses
 from trainer.profile import Hand
 from trainer.view import View
@@ -161,7 +161,8 @@ class ScriptedHands:
         yield from self._carry_round(tool, along_arc(contact, -back, self._radius), offset, vessel)
         run = 0.5 * RUN_UP_MM
         yield from self._slide_along_arc(tool, contact, offset, -back, -run)
-        tip = self._see.needle().position
+        here = self._see.needle()
+        tip, turned = here.position, here.quaternion
         travelled = 0.0
         while not self._see.hole(vessel, "outer"):
             target, normal = self._see.view.look(vessel, clock, bite, "outer")
@@ -172,7 +173,10 @@ class ScriptedHands:
             travelled += self._press_step()
             if travelled > run + wall / math.sin(angle) + 1.5:
                 raise Lost("the wall does not give way")
-            self._pose[tool] = needle_pose(tip, tangent, inward, 0.0, self._radius) @ offset
+            pose = needle_pose(tip, tangent, inward, 0.0, self._radius)
+            # The wall may have moved since the way was planned: the needle turns to it on the run, and does not leap.
+            pose = Rigid(tip, slerp(turned, pose.quaternion, min(1.0, travelled / run)))
+            self._pose[tool] = pose @ offset
             yield
         yield from self._follow_arc(
             tool, offset, lambda: self._see.arc_in(vessel, "outer") >= BITE_DEPTH_MM, BITE_DEPTH_MM + 1.0, 1.0
@@ -191,6 +195,9 @@ class ScriptedHands:
         tangent = math.cos(phi) * needle[:, 0] - math.sin(phi) * needle[:, 1]
         steep0 = math.asin(min(1.0, max(-1.0, float(-tangent @ normal))))
         steep1 = min(steep0, math.radians(STEER_DEG))
+        t, c = self._see.heading_in(vessel, normal, steep0, aside)
+        # How the needle lies as it is now, off the way planned: no hand leaps.
+        off = needle_pose(point, t, c, s0, self._radius).inverse() @ self._see.needle()
         seconds = max(2.0 * abs(steep1 - steep0) / TURN, (BITE_DEPTH_MM - s0) / (PRESS * self._hand.speed_mm_s))
         ticks = max(1, math.ceil(seconds / self._dt))
         for k in range(1, ticks + 1):
@@ -198,7 +205,8 @@ class ScriptedHands:
             pivoted = min(1.0, 3.0 * u)
             t, c = self._see.heading_in(vessel, normal, steep0 + pivoted * (steep1 - steep0), aside)
             at = point + pivoted * (rest - point)
-            self._pose[tool] = needle_pose(at, t, c, s0 + u * (BITE_DEPTH_MM - s0), self._radius) @ offset
+            way = needle_pose(at, t, c, s0 + u * (BITE_DEPTH_MM - s0), self._radius)
+            self._pose[tool] = way @ between(off, Rigid.identity(), pivoted) @ offset
             yield
 
     def _take_through(self, driving: int) -> Movement:
@@ -306,7 +314,7 @@ class ScriptedHands:
         """An instrument that carries nothing moves straight to ``target``."""
         start = self._pose[tool]
         bump = self._detour()
-        for u in self._paced(start, target, pace):
+        for u in self._paced(start, target, pace, 2.0 * float(np.linalg.norm(bump))):
             pose = between(start, target, u)
             self._pose[tool] = Rigid(pose.position + math.sin(math.pi * u) ** 2 * bump, pose.quaternion)
             yield
@@ -360,9 +368,10 @@ class ScriptedHands:
             self._pose[tool] = along_arc(pose, distance, self._radius) @ offset
             yield
 
-    def _paced(self, start: Rigid, target: Rigid, pace: float) -> Iterator[float]:
+    def _paced(self, start: Rigid, target: Rigid, pace: float, detour_mm: float) -> Iterator[float]:
+        way = float(np.linalg.norm(target.position - start.position)) + detour_mm
         seconds = max(
-            float(np.linalg.norm(target.position - start.position)) / (pace * self._hand.speed_mm_s),
+            way / (pace * self._hand.speed_mm_s),
             turn_angle(start, target) / TURN,
         )
         ticks = max(1, math.ceil(seconds / self._dt))

@@ -24,7 +24,7 @@ from trainer.mechanics.minimise import Base, Bodies, Held, Memory, approach
 #: Secant pairs kept from one solve to the next: fewer take more iterations where a thread draws at the tissue.
 PAIRS = 8
 #: More iterations than this in a solve: the kept factor no longer serves, begin a new one.
-SLOW = 4
+SLOW = 2
 
 
 @dataclass(frozen=True)
