@@ -19,6 +19,11 @@ Array = NDArray[np.float64]
 def unit(v: ArrayLike) -> Array:
     """Vector(s) ``(..., 3)`` scaled to length 1. Raises ValueError for a zero vector."""
     a = np.asarray(v, dtype=np.float64)
+    if a.shape == (3,):  # a dozen in a tick, in a fifth of the time
+        size = math.hypot(*a.tolist())
+        if size == 0.0:
+            raise ValueError("a direction of zero length has no unit vector")
+        return np.asarray(a / size)
     length = np.linalg.norm(a, axis=-1, keepdims=True)
     if np.any(length == 0.0):
         raise ValueError("a direction of zero length has no unit vector")
@@ -156,15 +161,16 @@ class Rigid:
 
     def apply(self, points_b: ArrayLike) -> Array:
         """Points ``(..., 3)`` of frame b in frame a."""
-        return np.asarray(points_b, dtype=np.float64) @ self.matrix.T + self.position
+        return np.asarray(np.dot(np.asarray(points_b, dtype=np.float64), self.matrix.T) + self.position)
 
     def rotate(self, directions_b: ArrayLike) -> Array:
         """Directions ``(..., 3)`` of frame b in frame a."""
-        return np.asarray(np.asarray(directions_b, dtype=np.float64) @ self.matrix.T)
+        return np.asarray(np.dot(np.asarray(directions_b, dtype=np.float64), self.matrix.T))
 
     def inverse(self) -> Rigid:
         """b_from_a."""
-        return Rigid(-(self.position @ self.matrix), quaternion_conjugate(self.quaternion))
+        w, x, y, z = self.quaternion.tolist()
+        return Rigid(-np.dot(self.position, self.matrix), np.array([w, -x, -y, -z]))
 
     def __matmul__(self, b_from_c: Rigid) -> Rigid:
         """a_from_c = a_from_b @ b_from_c."""

@@ -59,5 +59,4 @@ def needle_closest(needle: Needle, point: Array) -> tuple[float, float]:
         s = 0.0
     if s <= needle.length:
         return math.hypot(math.hypot(x, y) - needle.radius, z), s
-    ends = [(float(np.linalg.norm(needle_point(needle, end) - point)), end) for end in (0.0, needle.length)]
-    return min(ends)
+    return min((math.dist(needle_point(needle, end), point), end) for end in (0.0, needle.length))

@@ -122,13 +122,14 @@ def follow_needle(world: World, time_s: float, tool: str) -> None:
     if world.needle is None or world.solver is None:
         return
     length = world.needle.length
+    needle_from_scene = world.needle_pose.inverse()
     for hole in world.open_holes():
         if hole.arc > length:
             continue
-        at = world.needle_pose.inverse().apply(world.point(hole.place))
-        arc = _arc_through(world, at)
+        point = world.point(hole.place)
+        arc = _arc_through(world, needle_from_scene.apply(point))
         draw(hole, arc)
-        beyond = (world.needle_pose.position - world.point(hole.place)) @ hole.normal
+        beyond = (world.needle_pose.position - point) @ hole.normal
         hole.reached_mm = max(hole.reached_mm, float(-beyond if hole.inwards else beyond))
         shared = {
             "body": world.vessel_name(hole.place), "wall": hole.place.wall, "hole": hole.number,

@@ -19,6 +19,7 @@ from trainer.events import Event
 from trainer.geometry import Array, Rigid, fit_rotation
 from trainer.instruments.needle import Needle
 from trainer.mechanics.equilibrium import Equilibrium
+from trainer.mechanics.quasi_newton import at_points
 from trainer.mechanics.thread import ThreadModel
 
 
@@ -132,7 +133,9 @@ class World:
     def point(self, place: Place) -> Array:
         """Where a material point is now (3,) mm."""
         assert self.solver is not None
-        return np.asarray(place.weights @ self.solver.x[place.nodes])
+        where = np.zeros((1, 3))
+        at_points(self.solver.x, place.nodes[None], place.weights[None], where)
+        return np.asarray(where[0])
 
     def vessel_name(self, place: Place) -> str:
         assert self.tissue is not None

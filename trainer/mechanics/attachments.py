@@ -105,7 +105,7 @@ def flatten(anchors: Anchors, cables: tuple[Cable, ...], frictions: Frictions) -
         ("a friction's stiffness", frictions.stiffness),
         ("a friction's limit", frictions.limit),
     ):
-        if values.size and not np.isfinite(values).all():
+        if not all_finite(values):
             raise ValueError(f"{name} is not finite")
     if any(n < 2 for n in count):
         raise ValueError("a cable needs at least two points")
@@ -128,6 +128,15 @@ def flatten(anchors: Anchors, cables: tuple[Cable, ...], frictions: Frictions) -
         rub_stiffness=frictions.stiffness,
         rub_limit=frictions.limit,
     )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def all_finite(values: Array) -> bool:
+    """Whether each number is; for a few numbers an order faster than numpy."""
+    for v in values.flat:  # noqa: SIM110, numba has no all() of a generator
+        if not math.isfinite(v):
+            return False
+    return True
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
