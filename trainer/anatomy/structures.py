@@ -1,0 +1,39 @@
+"""The structures of a knee, as ``anatomy/structures.toml`` lists them: their numbers in volumes, kinds and colours."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Literal
+
+from trainer import config
+from trainer.config import Bounds, ConfigError
+from trainer.data_files import data_folder
+
+
+@dataclass(frozen=True)
+class Structure:
+    """One structure; ``number`` is its label in a volume of ours."""
+
+    number: int = field(metadata={"bounds": Bounds(1, 255)})
+    kind: Literal["bone", "cartilage", "meniscus", "ligament"]
+    rigid: bool
+    colour: tuple[int, int, int] = field(metadata={"bounds": Bounds(0, 255)})
+
+
+@cache
+def structures() -> dict[str, Structure]:
+    """All structures by name, in the order of their numbers. Raises ConfigError."""
+    path = data_folder("anatomy") / "structures.toml"
+    table = config.read_toml(path)
+    found = {name: config.build(Structure, entry, str(path), name) for name, entry in table.items()}
+    numbers = [s.number for s in found.values()]
+    for number in numbers:
+        if numbers.count(number) > 1:
+            raise ConfigError(f"{path}: number {number} is given to more than one structure")
+    return dict(sorted(found.items(), key=lambda item: item[1].number))
+
+
+def number_of(name: str) -> int:
+    """The label of a structure in a volume of ours. Raises KeyError."""
+    return structures()[name].number
