@@ -29,6 +29,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "events": set(),
     "geometry": set(),
     "clock": set(),
+    "meta_image": {"config"},
     "poses": {"geometry"},
     "motion": {"config", "geometry"},
     "view": {"geometry", "poses"},
@@ -37,13 +38,13 @@ MAY_IMPORT: dict[str, set[str]] = {
     "profile": {"calibration", "config", "data_files"},
     "choice": {"config", "curriculum", "data_files"},
     "mechanics": {"geometry"},
-    "anatomy": {"config", "curriculum", "geometry", "mechanics"},
+    "anatomy": {"config", "curriculum", "data_files", "geometry", "mechanics", "meta_image"},
     "instruments": {"config", "curriculum", "geometry", "poses", "mechanics"},
     "interactions": DATA | {"mechanics", "anatomy", "instruments", "view"},
     "log": {"config", "events", "geometry", "poses"},
     "sinks": {"events", "geometry", "poses", "log"},
     "scene": DATA | {"mechanics", "anatomy", "instruments", "interactions", "view", "sinks"},
-    "drivers": DATA | {"calibration", "log", "profile", "view"},
+    "drivers": DATA | {"calibration", "log", "meta_image", "profile", "view"},
     "session": {"clock", "drivers", "events", "geometry", "poses", "scene", "sinks"},
     "resimulation": DATA | {"log", "scene"},
     "metrics": DATA | {"log"},
@@ -161,7 +162,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A wheel of a copy of this tree; building must not warn that something is left out."""
     copy = tmp_path_factory.mktemp("wheel") / "copy"
     copy.mkdir()
-    for folder in ("trainer", "curricula", "devices", "reports"):
+    for folder in ("trainer", "anatomy", "curricula", "devices", "reports"):
         shutil.copytree(ROOT / folder, copy / folder, ignore=shutil.ignore_patterns("__pycache__"))
     for file in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / file, copy)
@@ -174,6 +175,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_wheel_holds_all_code_and_data(wheel: Path) -> None:
     data = [
+        *(ROOT / "anatomy").rglob("*.toml"),
         *(ROOT / "curricula").rglob("*.toml"),
         *(ROOT / "devices").rglob("*.toml"),
         *(p for p in (ROOT / "reports" / "templates").rglob("*") if p.is_file()),

@@ -104,7 +104,7 @@ def build_app() -> typer.Typer:
     """The command line with all its sub-commands."""
     import typer
 
-    from trainer.cli import bench, curricula, db, devices, export, report, sessions
+    from trainer.cli import anatomy, bench, curricula, db, devices, export, report, sessions
     from trainer.cli.practice import practice
     from trainer.cli.warmup import warmup
 
@@ -122,6 +122,7 @@ def build_app() -> typer.Typer:
     app.add_typer(report.app, name="report")
     app.add_typer(export.app, name="export")
     app.add_typer(devices.app, name="devices")
+    app.add_typer(anatomy.app, name="anatomy")
     app.add_typer(db.app, name="db")
     app.add_typer(bench.app, name="bench")
     app.command()(warmup)
