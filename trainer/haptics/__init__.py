@@ -1,0 +1,1 @@
+"""Forces for a hand, at a rate of their own."""
