@@ -38,6 +38,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "profile": {"calibration", "config", "data_files"},
     "choice": {"config", "curriculum", "data_files"},
     "mechanics": {"geometry"},
+    "haptics": {"geometry", "mechanics"},
     "anatomy": {"config", "curriculum", "data_files", "geometry", "mechanics", "meta_image"},
     "instruments": {"config", "curriculum", "geometry", "poses", "mechanics"},
     "interactions": DATA | {"mechanics", "anatomy", "instruments", "view"},
@@ -51,7 +52,18 @@ MAY_IMPORT: dict[str, set[str]] = {
     "reporting": DATA | {"log", "metrics"},
     "exports": DATA | {"log", "metrics"},
     "bench": DATA
-    | {"anatomy", "clock", "drivers", "interactions", "mechanics", "profile", "reporting", "scene", "session"},
+    | {
+        "anatomy",
+        "clock",
+        "drivers",
+        "haptics",
+        "interactions",
+        "mechanics",
+        "profile",
+        "reporting",
+        "scene",
+        "session",
+    },
 }
 #: Too heavy to be imported before a command knows that it needs them.
 HEAVY = {"numba", "numpy", "scipy", "rerun", "trimesh", "sqlite_utils", "rich"}

@@ -1,4 +1,4 @@
-"""Verification of the rendered force: over a press and release the wall gives nothing, and a held hand keeps its force."""
+"""Verification of the rendered force: over a press and release a wall gives nothing, and at rest it keeps its force."""
 
 from __future__ import annotations
 
@@ -36,7 +36,9 @@ def press(depth: float, period_s: float, sideways: float = 0.0) -> Array:
 
 
 @given(st.floats(0.3, 4.0), st.floats(0.05, 2.0), st.floats(100.0, 20_000.0), st.floats(0.0, 2.0))
-def test_a_press_and_release_gives_the_hand_no_energy(depth: float, period: float, stiffness: float, side: float) -> None:
+def test_a_press_and_release_gives_the_hand_no_energy(
+    depth: float, period: float, stiffness: float, side: float
+) -> None:
     """The work of the held forces on the hand is not positive, whatever speed, depth and stiffness.
 
     Cosines at 1 kHz: outwards each step is at most twice the one before but for the first after the turn, which is

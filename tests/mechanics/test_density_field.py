@@ -102,7 +102,7 @@ def test_the_force_is_continuous(numbers: list[float]) -> None:
     full · (0.71 + 2 · 2.46 / 0.2) per voxel. A jump at a voxel's face would show at any h.
     """
     field = field_of(ball(15.0))
-    out = np.array(numbers[:3]) + [2.0, 0.0, 0.0]
+    out = np.add(numbers[:3], [2.0, 0.0, 0.0])
     out /= np.linalg.norm(out)
     tip = 23.5 + (15.0 + numbers[3]) * out
     h = 1e-6

@@ -99,7 +99,9 @@ def read_record(folder: Path) -> dict[str, Any]:
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise ConfigError(f"{folder}: no imported anatomy: it has no {RECORD}; make one with `anatomy import`") from None
+        raise ConfigError(
+            f"{folder}: no imported anatomy: it has no {RECORD}; make one with `anatomy import`"
+        ) from None
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path}: cannot be read: {error}") from None
     if not isinstance(record, dict):
@@ -138,5 +140,6 @@ def _check_spacing(volume: LabelVolume, spacing_mm: float) -> None:
     box = np.array(volume.labels.shape) * volume.spacing_mm
     if not 0.05 <= spacing_mm <= box.min() or float(np.prod(box / spacing_mm)) > volume_file.MOST_VOXELS:
         raise ConfigError(
-            f"--spacing-mm {spacing_mm:g}: expected 0.05 to {box.min():g} mm, and at most {volume_file.MOST_VOXELS} voxels"
+            f"--spacing-mm {spacing_mm:g}: expected 0.05 to {box.min():g} mm, "
+            f"and at most {volume_file.MOST_VOXELS} voxels"
         )

@@ -60,7 +60,9 @@ def parse(table: dict[str, Any], name: str) -> LabelMap:
     labels: dict[int, str] = {}
     for key, structure in file.labels.items():
         if not key.isdecimal() or not 1 <= int(key) <= LARGEST_LABEL:
-            raise ConfigError(f"{name}: [labels] '{key}' is no label; expected a whole number from 1 to {LARGEST_LABEL}")
+            raise ConfigError(
+                f"{name}: [labels] '{key}' is no label; expected a whole number from 1 to {LARGEST_LABEL}"
+            )
         if structure not in structures() and structure != IGNORED:
             near = difflib.get_close_matches(structure, structures(), n=1, cutoff=0.5)
             hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(structures())}"
@@ -90,9 +92,7 @@ def check_against(given: LabelMap, present: set[int], file: str) -> None:
         )
     unnamed = sorted(present - set(given.labels))
     if unnamed:
-        raise ConfigError(
-            f"{given.path}: {_labels(unnamed)} of {file} not named; name it, or give it as '{IGNORED}'"
-        )
+        raise ConfigError(f"{given.path}: {_labels(unnamed)} of {file} not named; name it, or give it as '{IGNORED}'")
 
 
 def _labels(labels: list[int]) -> str:

@@ -93,7 +93,7 @@ def _side_of(bodies: Mapping[str, Body], lateral: str, medial: str) -> Side | No
 
 
 def _further(bodies: Mapping[str, Body], a: str, b: str, axis: int) -> float:
-    """How much further (mm) the centre of ``a`` lies along an axis of LPS than that of ``b``; 0 where one is missing."""
+    """How much further (mm) the centre of ``a`` lies along an axis of LPS than ``b``'s; 0 where one is missing."""
     if a not in bodies or b not in bodies:
         return 0.0
     return float(bodies[a].centre[axis] - bodies[b].centre[axis])

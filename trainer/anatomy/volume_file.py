@@ -29,6 +29,7 @@ NRRD_SPACES = {
     "las": (1, -1, 1),
 }
 RAS = (-1, -1, 1)
+NIFTI_MM = 2
 
 #: Cosine of the angle between two axes that still counts as square: NIfTI keeps its axes in single precision, texts
 #: keep six digits, and neither moves the far corner of 1000 voxels by more than one of them.
@@ -126,17 +127,19 @@ def _nifti(file: Path) -> tuple[np.ndarray, Array, Path]:
             known = bool(header["sform_code"]) or bool(header["qform_code"])
             spacing = np.asarray(header["pixdim"][1:4], dtype=np.float64)
             affine = np.asarray(image.affine, dtype=np.float64)
-            unit = header.get_xyzt_units()[0]
+            unit = int(header["xyzt_units"]) & 7
     except damage as error:
         if isinstance(error, ConfigError):
             raise
         raise _unreadable(file, error) from None
     if not known:
-        raise ConfigError(f"{file}: neither 'sform_code' nor 'qform_code' is set: which way the patient lies is not known")
+        raise ConfigError(
+            f"{file}: neither 'sform_code' nor 'qform_code' is set: which way the patient lies is not known"
+        )
     if not np.isfinite(spacing).all():
         raise ConfigError(f"{file}: spacing {_list(spacing)} is not finite")
-    if unit not in ("mm", "unknown"):
-        raise ConfigError(f"{file}: 'xyzt_units' must be mm, found {unit}")
+    if unit not in (NIFTI_MM, 0):
+        raise ConfigError(f"{file}: 'xyzt_units' must be mm, code {NIFTI_MM}, found code {unit}")
     return values, _affine(affine[:3, :3], affine[:3, 3], RAS), file
 
 

@@ -22,7 +22,7 @@ from trainer.mechanics.density_field import DensityField, density_field, force_a
 CALLS, ROUNDS = 10_000, 7
 
 
-def measure(beside: Callable[[float], None], seconds: float, rate_hz: float = 1000.0) -> dict[str, Any]:
+def measure(beside: Callable[[float], object], seconds: float, rate_hz: float = 1000.0) -> dict[str, Any]:
     """Run ``beside(seconds)`` in this thread with the haptic loop next to it, and a bare loop in another process.
 
     Numbers of the two loops are those of haptics.loop.period_report; ``p999_ratio`` compares them.

@@ -79,7 +79,9 @@ def import_(
           f"{_sizes(record['spacing_mm'])} mm")  # fmt: skip
     for row in record["structures"]:
         off = 100.0 * (row["surface_volume_ml"] / row["volume_ml"] - 1.0)
-        print(f"{row['structure']:<28} {row['volume_ml']:8.2f} mL   surface {row['triangles']:6d} triangles, {off:+.2f} %")
+        print(
+            f"{row['structure']:<28} {row['volume_ml']:8.2f} mL   surface {row['triangles']:6d} triangles, {off:+.2f} %"
+        )
     for name, how in record["swept"].items():
         print(f"swept: {name}, {how['volume_ml']:.2f} mL, {how['length_mm']:.1f} mm")
     for name, why in record["not_swept"].items():

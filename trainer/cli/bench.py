@@ -12,7 +12,9 @@ import typer
 from trainer.cli.sessions import JsonOption
 
 if TYPE_CHECKING:
+    from trainer.bench.realtime import Perform
     from trainer.clock import Realtime
+    from trainer.curriculum import TaskFile
 
 OutOption = Annotated[
     Path | None,
@@ -38,29 +40,16 @@ def realtime(
     as_json: JsonOption = False,
 ) -> None:
     """Run a task in real time, log and recording included, and tell the work of its ticks."""
-    from contextlib import ExitStack
     from tempfile import TemporaryDirectory
 
     from trainer.bench.machine import in_words, load
     from trainer.bench.realtime import measure
-    from trainer.cli.practice import perform
     from trainer.curriculum import load_task
-    from trainer.log.schema import new_session_id
 
     task_file = load_task(task)
     about = _machine()
     with TemporaryDirectory(prefix="trainer-bench-") as folder:
-
-        def session(seed: int, clock: Realtime, enough: Callable[[], bool]) -> str:
-            session_id = new_session_id()
-            log_path, recording = Path(folder) / "log.db", Path(folder) / f"{session_id}.rrd"
-            with ExitStack() as stack:
-                done = perform(
-                    stack, task_file, session_id, "bench", "scripted-expert", seed, clock, log_path, recording, enough
-                )
-            return str(done["outcome"])
-
-        found = measure(session, task_file.task.tick_hz, seconds)
+        found = measure(_session(task_file, Path(folder)), task_file.task.tick_hz, seconds)
     about["load_after"] = load()
     nodes = sum(2 * vessel.layers * vessel.around for vessel in task_file.task.scene.vessel)
     result = {"task": task_file.path, "nodes": nodes, **found, "machine": about}
@@ -75,6 +64,41 @@ def realtime(
     )
     print(f"overruns       {found['overruns']}")
     print(f"machine        {in_words(about)}")
+
+
+@app.command()
+def haptics(
+    seconds: Annotated[float, typer.Option(min=0.1, help="How long.")] = 60.0,
+    task: Annotated[str, typer.Option(metavar="FAMILY/TASK", help="What runs beside.")] = "anastomosis/single-stitch",
+    as_json: JsonOption = False,
+) -> None:
+    """Run the haptic loop beside a task in real time, and a bare sleeping loop, and compare their periods."""
+    from tempfile import TemporaryDirectory
+
+    from trainer.bench import haptics as loops
+    from trainer.bench import realtime as sessions
+    from trainer.bench.machine import in_words, load
+    from trainer.curriculum import load_task
+
+    task_file = load_task(task)
+    about = _machine()
+    with TemporaryDirectory(prefix="trainer-bench-") as folder:
+        session = _session(task_file, Path(folder))
+        found = loops.measure(lambda s: sessions.measure(session, task_file.task.tick_hz, s), seconds)
+    about["load_after"] = load()
+    result = {"task": task_file.path, "seconds": seconds, **found, "machine": about}
+    if as_json:
+        print(json.dumps(result, indent=2, allow_nan=False))
+        return
+    print(f"a haptic loop at {found['haptics']['rate_hz']:g} Hz beside {result['task']}; error of its periods, µs")
+    for name, row in (("haptic loop", found["haptics"]), ("bare loop", found["bare"])):
+        print(
+            f"{name:<12} median {row['p50_us']:.0f}, 99 % within {row['p99_us']:.0f}, 99.9 % within "
+            f"{row['p999_us']:.0f}, longest {row['max_us']:.0f} ({row['periods']} periods)"
+        )
+    print(f"99.9 %       {found['p999_ratio']:.2f} times the bare loop's")
+    print(f"evaluation   {found['evaluation_us']:.2f} µs from Python")
+    print(f"machine      {in_words(about)}")
 
 
 @app.command("speed-error")
@@ -141,6 +165,25 @@ def stability(
     typer.echo(f"written: {written}", err=True)
     if hard.counts(outcomes)["BROKEN"]:
         raise typer.Exit(1)
+
+
+def _session(task_file: TaskFile, folder: Path) -> Perform:
+    """Performs one session of a task by the scripted expert, log and recording in ``folder``."""
+    from contextlib import ExitStack
+
+    from trainer.cli.practice import perform
+    from trainer.log.schema import new_session_id
+
+    def session(seed: int, clock: Realtime, enough: Callable[[], bool]) -> str:
+        session_id = new_session_id()
+        log_path, recording = folder / "log.db", folder / f"{session_id}.rrd"
+        with ExitStack() as stack:
+            done = perform(
+                stack, task_file, session_id, "bench", "scripted-expert", seed, clock, log_path, recording, enough
+            )
+        return str(done["outcome"])
+
+    return session
 
 
 def _folder(out: Path | None, quick: bool) -> Path:

@@ -5,8 +5,8 @@ collection beside it do not make it wait. It meets the rest of the program in tw
 reads the device writes, and the state, whose first three numbers are the force. A tip that is half written when the
 loop reads it is off by one step of its motion at most.
 
-It waits with ``nanosleep`` and reads ``clock_gettime``, which Linux and macOS have. Periods are measured from wake-up to
-wake-up and counted by their error in whole microseconds.
+It waits with ``nanosleep`` and reads ``clock_gettime``, which Linux and macOS have. Periods are measured from wake-up
+to wake-up and counted by their error in whole microseconds.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
+from itertools import pairwise
 from types import TracebackType
 from typing import Any
 
@@ -27,8 +28,8 @@ from trainer.mechanics.density_field import DensityField
 #: Errors of a period from 0 to this many µs are counted apart, longer ones together.
 BINS_US = 50_000
 
-_nanosleep = types.ExternalFunction("nanosleep", types.int32(types.intp, types.intp))
-_clock_gettime = types.ExternalFunction("clock_gettime", types.int32(types.int32, types.intp))
+_nanosleep: Any = types.ExternalFunction("nanosleep", types.int32(types.intp, types.intp))
+_clock_gettime: Any = types.ExternalFunction("clock_gettime", types.int32(types.int32, types.intp))
 
 
 class HapticsError(RuntimeError):
@@ -98,7 +99,7 @@ def period_report(rate_hz: float, counts: np.ndarray, worst_ns: int) -> dict[str
 
     edges = [0, *(2**k for k in range(16)), len(counts)]
     histogram = [
-        {"from_us": low, "periods": int(counts[low:high].sum())} for low, high in zip(edges, edges[1:], strict=False)
+        {"from_us": low, "periods": int(counts[low:high].sum())} for low, high in pairwise(edges)
     ]
     return {
         "rate_hz": rate_hz,

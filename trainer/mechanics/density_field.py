@@ -53,9 +53,9 @@ def density_field(
     stiffness_mN_per_mm: float,
     limit_mN: float,
 ) -> DensityField:
-    """The field of the voxels that are ``rigid`` (nx, ny, nz) bool; voxel (0, 0, 0) has its centre at the volume's origin.
+    """The field of the voxels that are ``rigid`` (nx, ny, nz) bool.
 
-    ``limit_mN`` is the largest force that the device can make; no force is longer. Raises ValueError for a stiffness,
+    The centre of voxel (0, 0, 0) is the volume's origin. ``limit_mN`` is the largest force that the device can make; no force is longer. Raises ValueError for a stiffness,
     limit or spacing that is not positive and finite.
     """
     for name, value in (("stiffness", stiffness_mN_per_mm), ("limit", limit_mN), ("spacing", min(spacing_mm))):
