@@ -87,9 +87,11 @@ def swept_cruciates(volume: LabelVolume, side: str) -> tuple[LabelVolume, dict[s
     if missing and (needed or not side):
         why = f"no {' and no '.join(needed)}" if needed else "left or right is not known"
         return volume, swept, dict.fromkeys(missing, why)
+    if not missing:
+        return volume, swept, failed
     labels = volume.labels.copy()
+    knee = _register(volume, side)
     for name in missing:
-        knee = _register(volume, side)
         ends = _footprints(volume, knee, name)
         if ends is None:
             failed[name] = f"no free way between the bones within {REACH_MM:g} mm of its footprints"
