@@ -39,6 +39,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "choice": {"config", "curriculum", "data_files"},
     "mechanics": {"geometry"},
     "haptics": {"geometry", "mechanics"},
+    "pictures": {"geometry", "mechanics"},
     "anatomy": {"config", "curriculum", "data_files", "geometry", "mechanics", "meta_image"},
     "instruments": {"config", "curriculum", "geometry", "poses", "mechanics"},
     "interactions": DATA | {"mechanics", "anatomy", "instruments", "view"},

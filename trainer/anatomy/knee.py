@@ -260,17 +260,16 @@ def _tibia(s: TibiaSpec, x: Array, y: Array, z: float) -> Array:
     semi = [np.interp(down, levels, values) for values in (s.semi_x_mm, s.semi_z_mm)]
     body = np.maximum(_ellipse(centre, semi, x, z), y - s.plateau_level_mm)
     top = s.eminence_mm[1] - s.eminence_radius_mm
-    eminence = np.sqrt(
-        ((x - s.eminence_mm[0]) / 2.0) ** 2 + np.maximum(y - top, 0.0) ** 2 + (z - s.eminence_mm[2]) ** 2
-    ) - s.eminence_radius_mm
+    eminence = (
+        np.sqrt(((x - s.eminence_mm[0]) / 2.0) ** 2 + np.maximum(y - top, 0.0) ** 2 + (z - s.eminence_mm[2]) ** 2)
+        - s.eminence_radius_mm
+    )
     eminence = np.maximum(eminence, s.plateau_level_mm - 5.0 - y)
     facet = s.facet_radius_mm - _distance(s.facet_mm, x, y, z)
     return np.asarray(np.maximum(np.minimum(body, eminence), facet))
 
 
-def _meniscus(
-    s: MeniscusSpec, centre: Pair, semi: Pair, floor_mm: float, x: Array, y: Array, z: float
-) -> np.ndarray:
+def _meniscus(s: MeniscusSpec, centre: Pair, semi: Pair, floor_mm: float, x: Array, y: Array, z: float) -> np.ndarray:
     """Whether points lie in a ring's wedge above ``floor_mm``, its horns turned to z = 0."""
     part = (_ring(centre, semi, x, z) - s.inner) / (1.0 - s.inner)
     height = s.inner_height_mm + part * (s.rim_height_mm - s.inner_height_mm)
@@ -293,8 +292,8 @@ def _ellipse(centre: list[Array], semi: list[Array], x: Array, z: float) -> Arra
 
 def _ellipsoid(centre: Triple, semi: Triple, x: Array, y: Array, z: float) -> Array:
     """About the distance to an ellipsoid."""
-    p = [(a - b) / c for a, b, c in zip((x, y, z), centre, semi, strict=True)]
-    return np.asarray((np.sqrt(p[0] ** 2 + p[1] ** 2 + p[2] ** 2) - 1.0) * min(semi))
+    u, v, w = (x - centre[0]) / semi[0], (y - centre[1]) / semi[1], (z - centre[2]) / semi[2]
+    return np.asarray((np.sqrt(u**2 + v**2 + w**2) - 1.0) * min(semi))
 
 
 def _distance(centre: Triple, x: Array, y: Array, z: float) -> Array:

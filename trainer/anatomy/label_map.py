@@ -50,7 +50,12 @@ class _File:
 
 
 def read(path: Path) -> LabelMap:
-    """The label map in a TOML file. Raises ConfigError."""
+    """The label map in a TOML file, or the shipped one of that name. Raises ConfigError."""
+    named = _shipped_folder() / f"{path}.toml"
+    if not path.is_file():
+        if not named.is_file():
+            raise ConfigError(f"{path}: no such file, and no shipped label map ({', '.join(shipped_names())})")
+        path = named
     return parse(config.read_toml(path), str(path))
 
 
@@ -77,9 +82,18 @@ def parse(table: dict[str, Any], name: str) -> LabelMap:
     return LabelMap(name, labels, file.side)
 
 
-def shipped() -> list[LabelMap]:
+def shipped_names() -> list[str]:
     """The label maps that come with the program."""
-    return [read(path) for path in sorted((data_folder("anatomy") / "labels").glob("*.toml"))]
+    return sorted(path.stem for path in _shipped_folder().glob("*.toml"))
+
+
+def shipped() -> list[LabelMap]:
+    """All of them, in the order of their names."""
+    return [read(_shipped_folder() / f"{name}.toml") for name in shipped_names()]
+
+
+def _shipped_folder() -> Path:
+    return data_folder("anatomy") / "labels"
 
 
 def check_against(given: LabelMap, present: set[int], file: str) -> None:

@@ -182,7 +182,7 @@ class _Surroundings:
     def voxel(self, points: Array) -> np.ndarray:
         """Indices (..., 3) of the voxels at ``points`` (..., 3), or of the nearest ones in reach."""
         index = np.round(points / self.spacing).astype(int) - self.corner
-        return np.clip(index, 0, np.array(self.labels.shape) - 1)
+        return np.asarray(np.clip(index, 0, np.array(self.labels.shape) - 1))
 
     def on_surface(self, bone: str, points: Array) -> Array:
         i, j, k = self.voxel(points).T

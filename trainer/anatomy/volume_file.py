@@ -86,10 +86,9 @@ def read(path: str | Path) -> FileVolume:
 def _nrrd(file: Path) -> tuple[np.ndarray, Array, Path]:
     import nrrd
 
-    damage = (nrrd.NRRDError, OSError, EOFError, ValueError, KeyError, IndexError, TypeError, MemoryError, zlib.error)
     try:
         values, header = nrrd.read(str(file))
-    except damage as error:
+    except Exception as error:  # a damaged file makes that reader raise whatever its bytes lead to
         raise _unreadable(file, error) from None
     if values.ndim != 3:
         raise _not_three(file, values.shape)
@@ -111,11 +110,7 @@ def _nrrd(file: Path) -> tuple[np.ndarray, Array, Path]:
 
 def _nifti(file: Path) -> tuple[np.ndarray, Array, Path]:
     import nibabel
-    from nibabel.filebasedimages import ImageFileError
-    from nibabel.spatialimages import HeaderDataError
 
-    damage = (ImageFileError, HeaderDataError, OSError, EOFError, ValueError, KeyError, IndexError, TypeError,
-              OverflowError, MemoryError, zlib.error)  # fmt: skip
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # a NaN in the header is told below, as an error
@@ -128,9 +123,9 @@ def _nifti(file: Path) -> tuple[np.ndarray, Array, Path]:
             spacing = np.asarray(header["pixdim"][1:4], dtype=np.float64)
             affine = np.asarray(image.affine, dtype=np.float64)
             unit = int(header["xyzt_units"]) & 7
-    except damage as error:
-        if isinstance(error, ConfigError):
-            raise
+    except ConfigError:
+        raise
+    except Exception as error:  # as above
         raise _unreadable(file, error) from None
     if not known:
         raise ConfigError(

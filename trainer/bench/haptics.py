@@ -9,7 +9,8 @@ from __future__ import annotations
 import multiprocessing
 import time
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
+from multiprocessing.connection import Connection
+from multiprocessing.synchronize import Event
 from typing import Any
 
 import numpy as np
@@ -28,15 +29,21 @@ def measure(beside: Callable[[float], object], seconds: float, rate_hz: float = 
     Numbers of the two loops are those of haptics.loop.period_report; ``p999_ratio`` compares them.
     """
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, mp_context=context) as pool:
-        pool.submit(bare, 0.01, rate_hz).result()  # the process is there, its modules are loaded
+    stop, (here, there) = context.Event(), context.Pipe()
+    other = context.Process(target=bare, args=(stop, there, rate_hz), name="bare loop", daemon=True)
+    other.start()
+    try:
+        here.recv()  # its modules are loaded, it is about to begin
         field = ball()
         with HapticLoop(field, rate_hz) as loop:
             loop.tip[:] = 0.0, 0.0, 15.0
-            other = pool.submit(bare, seconds, rate_hz)
             beside(seconds)
             rendered = loop.report()
-        slept = other.result()
+        stop.set()
+        slept = here.recv()
+    finally:
+        stop.set()
+        other.join()
     return {
         "haptics": rendered,
         "bare": slept,
@@ -45,14 +52,14 @@ def measure(beside: Callable[[float], object], seconds: float, rate_hz: float = 
     }
 
 
-def bare(seconds: float, rate_hz: float) -> dict[str, Any]:
-    """A loop that only sleeps, for so long; errors of its periods as those of a haptic loop."""
+def bare(stop: Event, answer: Connection, rate_hz: float) -> None:
+    """A loop that only sleeps, until it is told to stop; sends the errors of its periods as those of a haptic loop."""
+    answer.send("ready")
     counts = np.zeros(BINS_US + 1, dtype=np.int64)
     worst = 0
     period = round(1e9 / rate_hz)
     woken = due = time.monotonic_ns()
-    end = due + round(seconds * 1e9)
-    while woken < end:
+    while not stop.is_set():
         due = max(due + period, woken - 10 * period)
         while (now := time.monotonic_ns()) < due:
             time.sleep((due - now) * 1e-9)
@@ -60,7 +67,7 @@ def bare(seconds: float, rate_hz: float) -> dict[str, Any]:
         woken = now
         worst = max(worst, error)
         counts[min(error // 1000, BINS_US)] += 1
-    return period_report(rate_hz, counts, worst)
+    answer.send(period_report(rate_hz, counts, worst))
 
 
 def ball() -> DensityField:

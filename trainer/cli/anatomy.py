@@ -17,11 +17,10 @@ PathArgument = Annotated[Path, typer.Argument(metavar="PATH", help="A label volu
 @app.command("list")
 def list_(as_json: JsonOption = False) -> None:
     """List the built-in knees, the shipped label maps and the structures that a knee may have."""
-    from trainer.anatomy import label_map
+    from trainer.anatomy import knee, label_map
     from trainer.anatomy.structures import structures
-    from trainer.data_files import data_folder
 
-    knees = sorted(path.stem for path in (data_folder("anatomy") / "knees").glob("*.toml"))
+    knees = knee.names()
     maps = {Path(m.path).stem: sorted(m.labels.values()) for m in label_map.shipped()}
     kinds = {name: structure.kind for name, structure in structures().items()}
     if as_json:
@@ -39,7 +38,10 @@ def list_(as_json: JsonOption = False) -> None:
 def inspect(
     path: PathArgument,
     labels: Annotated[
-        Path | None, typer.Option(metavar="TOML", help="Which label is which structure; otherwise recognised.")
+        Path | None,
+        typer.Option(
+            metavar="TOML", help="Which label is which structure, a file or a shipped map; otherwise recognised."
+        ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -61,7 +63,9 @@ def inspect(
 @app.command("import")
 def import_(
     path: PathArgument,
-    labels: Annotated[Path, typer.Option(metavar="TOML", help="Which label is which structure.")],
+    labels: Annotated[
+        Path, typer.Option(metavar="TOML", help="Which label is which structure: a file, or a shipped map's name.")
+    ],
     out: Annotated[Path, typer.Option(metavar="DIR", help="A new folder for the knee.")],
     spacing_mm: Annotated[
         float | None, typer.Option(metavar="MM", help="Resample to cubes of this size; otherwise as the scan is.")

@@ -98,9 +98,7 @@ def period_report(rate_hz: float, counts: np.ndarray, worst_ns: int) -> dict[str
         return float(min(ends[int(np.searchsorted(upto, part * total))], worst_ns * 1e-3)) if total else 0.0
 
     edges = [0, *(2**k for k in range(16)), len(counts)]
-    histogram = [
-        {"from_us": low, "periods": int(counts[low:high].sum())} for low, high in pairwise(edges)
-    ]
+    histogram = [{"from_us": low, "periods": int(counts[low:high].sum())} for low, high in pairwise(edges)]
     return {
         "rate_hz": rate_hz,
         "periods": total,

@@ -43,7 +43,7 @@ class DensityField:
     """A smoothed volume and what :func:`force_at` needs to know of it."""
 
     density: np.ndarray  # (nx, ny, nz) float32, 0 … 1, with a rim of zeros
-    constants: Array  # (17,): rotation by rows and origin, world from volume; 1 / spacing; force at density 1; limit
+    constants: Array  # (17,): rotation and origin, world from volume; 1 / spacing; force at density 1, limit
 
 
 def density_field(
@@ -55,8 +55,8 @@ def density_field(
 ) -> DensityField:
     """The field of the voxels that are ``rigid`` (nx, ny, nz) bool.
 
-    The centre of voxel (0, 0, 0) is the volume's origin. ``limit_mN`` is the largest force that the device can make; no force is longer. Raises ValueError for a stiffness,
-    limit or spacing that is not positive and finite.
+    The centre of voxel (0, 0, 0) is the volume's origin. ``limit_mN`` is the largest force that the device can make; no
+    force is longer. Raises ValueError for a stiffness, limit or spacing that is not positive and finite.
     """
     for name, value in (("stiffness", stiffness_mN_per_mm), ("limit", limit_mN), ("spacing", min(spacing_mm))):
         if not (math.isfinite(value) and value > 0.0):
@@ -92,7 +92,7 @@ def smooth_axis(density: np.ndarray, weights: np.ndarray) -> None:
                 before2, before1, here, after1 = before1, here, after1, after2
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@njit(cache=True, nogil=True, error_model="numpy")
 def sample(density: np.ndarray, u: float, v: float, w: float) -> float:
     """The density at (u, v, w) in voxels, trilinear; 0 outside the grid.
 
@@ -109,7 +109,7 @@ def sample(density: np.ndarray, u: float, v: float, w: float) -> float:
     d11 = density[i + 1, j + 1, k] + c * (density[i + 1, j + 1, k + 1] - density[i + 1, j + 1, k])
     d0 = d00 + b * (d01 - d00)
     d1 = d10 + b * (d11 - d10)
-    return d0 + a * (d1 - d0)
+    return float(d0 + a * (d1 - d0))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

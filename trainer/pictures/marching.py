@@ -22,6 +22,8 @@ WIDE_STEP = 1.25
 #: The surface is where the density is half of 255.
 LEVEL = 127.5
 BISECTIONS = 5
+#: From this density on a place is inside and shows no surface; interpolating eight times 255 may round below it.
+INSIDE = 254.5
 #: Steps beyond a surface within which its label is looked for: the filter's reach.
 AHEAD = 5
 #: Light from the eye, as an arthroscope has it, and what comes from everywhere; assumed.
@@ -32,7 +34,7 @@ UNTURNED = 0.5
 OPAQUE = 0.98
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@njit(cache=True, nogil=True, error_model="numpy")
 def density_at(density: np.ndarray, u: float, v: float, w: float) -> float:
     """The density (0 … 255) at (u, v, w) in voxels, trilinear; outside the grid that of the nearest place in it."""
     nx, ny, nz = density.shape
@@ -43,10 +45,10 @@ def density_at(density: np.ndarray, u: float, v: float, w: float) -> float:
     d01 = (1.0 - c) * density[i, j + 1, k] + c * density[i, j + 1, k + 1]
     d10 = (1.0 - c) * density[i + 1, j, k] + c * density[i + 1, j, k + 1]
     d11 = (1.0 - c) * density[i + 1, j + 1, k] + c * density[i + 1, j + 1, k + 1]
-    return (1.0 - a) * ((1.0 - b) * d00 + b * d01) + a * ((1.0 - b) * d10 + b * d11)
+    return float((1.0 - a) * ((1.0 - b) * d00 + b * d01) + a * ((1.0 - b) * d10 + b * d11))
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@njit(cache=True, nogil=True, error_model="numpy")
 def enter(lowest: float, highest: float, o: float, d: float, t0: float, t1: float) -> tuple[float, float]:
     """The part of t0 … t1 in which o + t d lies between two planes; empty (t0 > t1) where it never does."""
     if d == 0.0:
@@ -55,7 +57,7 @@ def enter(lowest: float, highest: float, o: float, d: float, t0: float, t1: floa
     return max(t0, min(a, b)), min(t1, max(a, b))
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@njit(cache=True, nogil=True, error_model="numpy")
 def leave_brick(u: float, v: float, w: float, du: float, dv: float, dw: float) -> float:
     """How far along the ray its brick ends, and a little more."""
     t = math.inf
@@ -68,7 +70,7 @@ def leave_brick(u: float, v: float, w: float, du: float, dv: float, dw: float) -
     return max(t, 0.0) + 1e-3
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@njit(cache=True, nogil=True, error_model="numpy")
 def shown_label(labels: np.ndarray, opacity: Array, u: float, v: float, w: float) -> int:
     """The label nearest to (u, v, w) among the eight voxels around it that is shown; 0 where none is."""
     nx, ny, nz = labels.shape
@@ -84,11 +86,11 @@ def shown_label(labels: np.ndarray, opacity: Array, u: float, v: float, w: float
     return found
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@njit(cache=True, nogil=True, error_model="numpy")
 def brightness(
     density: np.ndarray, inverse: Array, u: float, v: float, w: float, du: float, dv: float, dw: float
 ) -> float:
-    """Light that a surface at (u, v, w) sends back along the ray: Lambert's, from the eye, with some from everywhere."""
+    """Light that a surface sends back along the ray: Lambert's, from the eye, with some from everywhere."""
     gx = (density_at(density, u + 1.0, v, w) - density_at(density, u - 1.0, v, w)) * inverse[0]
     gy = (density_at(density, u, v + 1.0, w) - density_at(density, u, v - 1.0, w)) * inverse[1]
     gz = (density_at(density, u, v, w + 1.0) - density_at(density, u, v, w - 1.0)) * inverse[2]
@@ -172,7 +174,7 @@ def march(
                         part = 1.0 - math.exp(-opacity[label] * d / 255.0 * step)
                     if part > 0.0:
                         light = left_over * part
-                        if d < 255.0:
+                        if d < INSIDE:
                             light *= brightness(density, inverse, u, v, w, du, dv, dw)
                         else:
                             light *= AMBIENT + (1.0 - AMBIENT) * UNTURNED
