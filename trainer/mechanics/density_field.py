@@ -92,7 +92,7 @@ def smooth_axis(density: np.ndarray, weights: np.ndarray) -> None:
                 before2, before1, here, after1 = before1, here, after1, after2
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def sample(density: np.ndarray, u: float, v: float, w: float) -> float:
     """The density at (u, v, w) in voxels, trilinear; 0 outside the grid.
 
