@@ -10,7 +10,7 @@ import pytest
 import trimesh
 from volume_files import write_nrrd
 
-from trainer.anatomy import imported, inspection, knee, label_map, ligaments, surfaces, volume_file
+from trainer.anatomy import imported, inspection, knee, label_map, library, ligaments, surfaces, volume_file
 from trainer.anatomy.label_volume import LabelVolume, resample
 from trainer.anatomy.label_volume import write_nrrd as write_ours
 from trainer.anatomy.structures import number_of, structures
@@ -187,6 +187,30 @@ def test_import_makes_a_knee_with_its_origin(scan: Path, built: LabelVolume, tmp
     np.testing.assert_array_equal(made.volume.labels, built.labels)
     with pytest.raises(ConfigError, match="is there already"):
         imported.import_volume(scan, write_map(tmp_path), out)
+
+
+def test_a_knee_is_found_by_its_name_or_folder(scan: Path, built: LabelVolume, tmp_path: Path) -> None:
+    imported.import_volume(scan, write_map(tmp_path), tmp_path / "mine")
+    for anatomy in (library.load("knee", 1.0), library.load(str(tmp_path / "mine"))):
+        np.testing.assert_array_equal(anatomy.volume.labels, built.labels)
+        assert anatomy.side == "right"
+    with pytest.raises(ConfigError, match="no knee 'elbow': expected knee, or a folder"):
+        library.load("elbow")
+
+
+def test_labels_may_be_large_numbers(scan: Path, tmp_path: Path) -> None:
+    """Labels of two bytes, as whole-body segmentations have them."""
+    file = volume_file.read(scan)
+    write_nrrd(
+        tmp_path / "large.nrrd",
+        np.where(file.values > 0, file.values * 100.0, 0.0).astype(np.uint16),
+        file.lps_from_index,
+    )
+    changes = {str(k): "" for k in range(21, 31)} | {
+        str(100 * (k + 20)): n for k, n in enumerate(structures(), 1) if k <= 10
+    }
+    record = imported.import_volume(tmp_path / "large.nrrd", write_map(tmp_path, changes), tmp_path / "mine")
+    assert len(record["structures"]) == 12
 
 
 def test_import_resamples(scan: Path, tmp_path: Path) -> None:

@@ -30,6 +30,8 @@ Four = tuple[float, float, float, float]
 
 #: Resolutions that make sense, mm: a finer one takes gigabytes, a coarser one has no cartilage.
 FINEST_MM, COARSEST_MM = 0.15, 2.0
+#: Of a usual scan's slices.
+USUAL_MM = 0.7
 
 
 @dataclass(frozen=True)
@@ -160,7 +162,7 @@ def names() -> list[str]:
     return sorted(path.stem for path in (data_folder("anatomy") / "knees").glob("*.toml"))
 
 
-def build(spec: KneeSpec, voxel_mm: float = 0.7) -> LabelVolume:
+def build(spec: KneeSpec, voxel_mm: float = USUAL_MM) -> LabelVolume:
     """The knee as labels in cubes of ``voxel_mm``; the knee's origin is the patient's. Raises ConfigError."""
     if not FINEST_MM <= voxel_mm <= COARSEST_MM:
         raise ConfigError(f"a knee is made of voxels of {FINEST_MM} to {COARSEST_MM} mm, found {voxel_mm:g}")

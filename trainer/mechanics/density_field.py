@@ -121,13 +121,15 @@ def force_at(density: np.ndarray, constants: Array, tip: Array, force: Array, di
     feels nothing.
     """
     c = constants
+    force[0], force[1], force[2] = 0.0, 0.0, 0.0
+    if not (math.isfinite(tip[0]) and math.isfinite(tip[1]) and math.isfinite(tip[2])):
+        return 0.0
     x, y, z = tip[0] - c[9], tip[1] - c[10], tip[2] - c[11]
     u = (c[0] * x + c[3] * y + c[6] * z) * c[12]
     v = (c[1] * x + c[4] * y + c[7] * z) * c[13]
     w = (c[2] * x + c[5] * y + c[8] * z) * c[14]
     d = sample(density, u, v, w)
     if d <= 0.0:
-        force[0], force[1], force[2] = 0.0, 0.0, 0.0
         return 0.0
     gx = (sample(density, u - 1.0, v, w) - sample(density, u + 1.0, v, w)) * c[12]
     gy = (sample(density, u, v - 1.0, w) - sample(density, u, v + 1.0, w)) * c[13]
