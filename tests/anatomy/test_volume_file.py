@@ -195,7 +195,7 @@ BAD = {
     "nifti 4-d": "4 dimensions",
     "nifti without code": "neither 'sform_code' nor 'qform_code' is set",
     "nifti nan": "spacing nan × .* is not finite",
-    "mha truncated": "the elements are cut short: 40 of 60 bytes",
+    "mha truncated": "the pictures are cut short: 40 of 60 bytes",
     "mha packed truncated": "cut short or damaged",
     "mha nan": "is not finite",
     "mha 4-d": "4 dimensions",

@@ -143,9 +143,11 @@ def _footprints(volume: LabelVolume, knee: _Knee, ligament: str) -> tuple[Array,
     on_tibia = knee.eminence + knee.scale * (tibia - [whole[0], level, 0.0]) @ knee.axes.T
     bones = _Surroundings.around(volume, np.concatenate([on_femur, on_tibia]))
     steps = np.arange(-REACH_MM, REACH_MM + 0.5 * STEP_MM, STEP_MM)
+    x, y = knee.axes[:, 0], knee.axes[:, 1]
+    upper = {(f, u): bones.on_surface("femur", on_femur + f * x + u * y) for f, u in product(steps, steps)}
+    lower = {f: bones.on_surface("tibia", on_tibia + f * x) for f in steps}
     for front, up, tibia_front in sorted(product(steps, steps, steps), key=lambda m: float(np.dot(m, m))):
-        a = bones.on_surface("femur", on_femur + front * knee.axes[:, 0] + up * knee.axes[:, 1])
-        b = bones.on_surface("tibia", on_tibia + tibia_front * knee.axes[:, 0])
+        a, b = upper[front, up], lower[tibia_front]
         if bones.free(a, b):
             return a, b
     return None

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from trainer import meta_image
+from trainer import image_header
 from trainer.config import ConfigError
 from trainer.geometry import Array
 
@@ -139,8 +139,8 @@ def _nifti(file: Path) -> tuple[np.ndarray, Array, Path]:
 
 
 def _mha(file: Path) -> tuple[np.ndarray, Array, Path]:
-    header, begins = meta_image.read_header(file)
-    sizes = meta_image.dimensions(header, str(file))
+    header, begins = image_header.read_meta_image(file)
+    sizes = image_header.sizes(header, "DimSize", str(file))
     if len(sizes) != 3:
         raise _not_three(file, tuple(sizes))
     if int(np.prod([float(s) for s in sizes])) > MOST_VOXELS:
@@ -148,7 +148,7 @@ def _mha(file: Path) -> tuple[np.ndarray, Array, Path]:
     spacing = _numbers(header, ("ElementSpacing", "ElementSize"), [1.0] * 3, file)
     origin = _numbers(header, ("Offset", "Position", "Origin"), [0.0] * 3, file)
     axes = _numbers(header, ("TransformMatrix", "Rotation", "Orientation"), np.eye(3).ravel().tolist(), file)
-    kind, channels = meta_image.element_type(header, str(file))
+    kind, channels = image_header.element_type(header, str(file))
     if channels != 1:
         raise ConfigError(f"{file}: {channels} channels; expected one label for each voxel")
     local = header["ElementDataFile"].upper() == "LOCAL"
@@ -159,10 +159,10 @@ def _mha(file: Path) -> tuple[np.ndarray, Array, Path]:
             data = zlib.decompress(data)
     except (OSError, zlib.error) as error:
         raise _unreadable(elements, error) from None
-    meta_image.check_size(header, len(data), str(file))
     swapped = {header.get(k, "False").lower() for k in ("BinaryDataByteOrderMSB", "ElementByteOrderMSB")}
     order = ">" if "true" in swapped else "<"
     count = int(np.prod(sizes, dtype=np.int64))
+    image_header.check_length(len(data), count * int(kind[1]), str(file))
     values = np.frombuffer(data, np.dtype(f"{order}{kind}"), count).reshape(sizes, order="F")
     return values, _affine(axes.reshape(3, 3).T * spacing, origin, (1, 1, 1)), elements
 

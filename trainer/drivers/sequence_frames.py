@@ -33,27 +33,6 @@ def keep(fields: Fields, key: str, value: str) -> bool:
     return match is not None
 
 
-def sizes(header: dict[str, str], key: str, name: str) -> list[int]:
-    """The pictures' size along each axis, as the header's ``key`` has it. Raises ConfigError."""
-    try:
-        found = [int(text) for text in header[key].split()]
-    except KeyError:
-        raise ConfigError(f"{name}: the header has no '{key}'") from None
-    except ValueError:
-        found = []
-    if not found or min(found) < 0:
-        raise ConfigError(f"{name}: '{key}' expected whole numbers, found '{header[key]}'")
-    return found
-
-
-def check_length(data_bytes: int, expected: int, name: str) -> None:
-    """Raises ConfigError where fewer bytes than ``expected`` stand behind the header."""
-    if data_bytes < expected:
-        raise ConfigError(
-            f"{name}: the pictures are cut short: {data_bytes} of {expected} bytes are there; copy the file again"
-        )
-
-
 def motion(fields: Fields, n: int, said_by: str, name: str) -> Motion:
     """The recording of ``n`` frames, as the header's ``said_by`` has it. Raises ConfigError, one line."""
     present = 1 + max((max(values) for values in fields.values()), default=-1)

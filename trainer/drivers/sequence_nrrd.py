@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+from trainer import image_header
 from trainer.config import ConfigError
 from trainer.drivers import sequence_frames
 from trainer.drivers.sequence_frames import Fields
@@ -28,7 +29,7 @@ def read(path: str | Path) -> Motion:
     """The recording in a sequence file; the pictures are not read. Raises ConfigError, one line."""
     name = str(path)
     header, fields, data_bytes = _read_header(Path(path), name)
-    sizes = sequence_frames.sizes(header, "sizes", name)
+    sizes = image_header.sizes(header, "sizes", name)
     kinds = header.get("kinds", "").lower().split()
     axis = next((i for i, kind in enumerate(kinds) if kind in ("list", "time") and i < len(sizes)), -1)
     motion = sequence_frames.motion(fields, sizes[axis], "sizes", name)
@@ -73,4 +74,4 @@ def _check_pixels(header: dict[str, str], sizes: list[int], data_bytes: int, nam
     short = short.replace("long long", "longlong").removesuffix(" int")
     if short not in ELEMENT_BYTES:
         raise ConfigError(f"{name}: unknown 'type: {kind}'")
-    sequence_frames.check_length(data_bytes, elements * ELEMENT_BYTES[short], name)
+    image_header.check_length(data_bytes, elements * ELEMENT_BYTES[short], name)

@@ -1,11 +1,10 @@
-"""MetaImage headers (``.mha``, ``.mhd``): text lines ``key = value`` up to ``ElementDataFile``, then the elements.
+"""What sequence files of trackers and label volumes share of their headers.
 
-Sequence files with tracker poses and label volumes both begin with one.
+MetaImage (``.mha``, ``.mhd``) is text lines ``key = value`` up to ``ElementDataFile``, then the elements.
 """
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 from trainer.config import ConfigError
@@ -17,8 +16,8 @@ ELEMENT_TYPES = {
 }  # fmt: skip
 
 
-def read_header(path: Path) -> tuple[dict[str, str], int]:
-    """The keys of the header in their order, and where the elements begin, in bytes. Raises ConfigError."""
+def read_meta_image(path: Path) -> tuple[dict[str, str], int]:
+    """The keys of a MetaImage's header in their order, and where the elements begin, in bytes. Raises ConfigError."""
     header: dict[str, str] = {}
     try:
         with path.open("rb") as file:
@@ -36,21 +35,21 @@ def read_header(path: Path) -> tuple[dict[str, str], int]:
     raise ConfigError(f"{path}: the header is cut short: no line 'ElementDataFile = …' at its end; copy the file again")
 
 
-def dimensions(header: dict[str, str], name: str) -> list[int]:
-    """``DimSize``. Raises ConfigError when it is missing or not made of whole numbers."""
+def sizes(header: dict[str, str], key: str, name: str) -> list[int]:
+    """The pictures' size along each axis, as the header's ``key`` has it. Raises ConfigError."""
     try:
-        sizes = [int(s) for s in header["DimSize"].split()]
+        found = [int(text) for text in header[key].split()]
     except KeyError:
-        raise ConfigError(f"{name}: the header has no 'DimSize'") from None
+        raise ConfigError(f"{name}: the header has no '{key}'") from None
     except ValueError:
-        sizes = []
-    if not sizes or min(sizes) < 0:
-        raise ConfigError(f"{name}: 'DimSize' expected whole numbers, found '{header['DimSize']}'")
-    return sizes
+        found = []
+    if not found or min(found) < 0:
+        raise ConfigError(f"{name}: '{key}' expected whole numbers, found '{header[key]}'")
+    return found
 
 
 def element_type(header: dict[str, str], name: str) -> tuple[str, int]:
-    """The elements' type as numpy calls it, without byte order, and the number of channels. Raises ConfigError."""
+    """The type of MetaImage's elements in numpy's words, without byte order, and their channels. Raises ConfigError."""
     kind = header.get("ElementType", "")
     channels = header.get("ElementNumberOfChannels", "1")
     if kind not in ELEMENT_TYPES or not channels.isdecimal():
@@ -58,11 +57,9 @@ def element_type(header: dict[str, str], name: str) -> tuple[str, int]:
     return ELEMENT_TYPES[kind], int(channels)
 
 
-def check_size(header: dict[str, str], found_bytes: int, name: str) -> None:
-    """Raises ConfigError where fewer bytes are there than the header's elements take; more are accepted."""
-    kind, channels = element_type(header, name)
-    expected = math.prod(dimensions(header, name)) * int(kind[1]) * channels
-    if found_bytes < expected:
+def check_length(data_bytes: int, expected: int, name: str) -> None:
+    """Raises ConfigError where fewer bytes than ``expected`` stand behind the header; more are accepted."""
+    if data_bytes < expected:
         raise ConfigError(
-            f"{name}: the elements are cut short: {found_bytes} of {expected} bytes are there; copy the file again"
+            f"{name}: the pictures are cut short: {data_bytes} of {expected} bytes are there; copy the file again"
         )
