@@ -47,6 +47,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "sinks": {"events", "geometry", "poses", "log"},
     "scene": DATA | {"mechanics", "anatomy", "instruments", "interactions", "view", "sinks"},
     "drivers": DATA | {"calibration", "log", "image_header", "profile", "view"},
+    "simulators": DATA | {"drivers", "log", "profile"},
     "session": {"clock", "drivers", "events", "geometry", "poses", "scene", "sinks"},
     "resimulation": DATA | {"log", "scene"},
     "metrics": DATA | {"log"},

@@ -71,19 +71,85 @@ class RecordingSpec:
 
 
 @dataclass(frozen=True)
+class Bird:
+    """One unit of the flock and the instrument that its sensor is fixed to."""
+
+    address: int = field(metadata={"bounds": Bounds(1, 14)})  # as its switches say
+    tool: Literal["left", "right"]
+    port: str = ""  # its own; empty: it reports through the flock's port
+    closure: float = field(default=1.0, metadata={"bounds": Bounds(0.0, 1.0)})  # jaws, where no sensor measures them
+    position_mm: Vector = field(default=(0.0, 0.0, 0.0), metadata=POSITION_MM)  # sensor_from_tool
+    rotation_deg: Vector = field(default=(0.0, 0.0, 0.0), metadata=ANGLE_DEG)  # about x, then y, then z
+
+
+@dataclass(frozen=True)
+class MinibirdSpec:
+    """A flock of miniBIRDs: world = anchor · scene_from_device · (scale · position, rotation) · sensor_from_tool."""
+
+    bird: tuple[Bird, ...]
+    port: str = ""  # of the flock, in group mode: /dev/ttyUSB0, or any address that pyserial knows
+    baud: int = field(default=115200, metadata={"bounds": Bounds(2400, 4_000_000)})
+    rate_hz: float = field(default=103.0, metadata={"bounds": Bounds(20.0, 144.0)})  # of measurement
+    hemisphere: Literal["forward", "aft", "lower", "upper", "right", "left"] = "forward"
+    quaternion: Literal["measured", "direct", "inverse"] = "measured"  # whose rotation is sent: compared with angles
+    reset: bool = False  # by RTS at the start; needs a cable that has it
+    scale: float = field(default=1.0, metadata={"bounds": Bounds(1e-6, 1e6)})  # of positions
+    position_mm: Vector = field(default=(0.0, 0.0, 0.0), metadata=POSITION_MM)
+    rotation_deg: Vector = field(default=(0.0, 0.0, 0.0), metadata=ANGLE_DEG)  # about x, then y, then z
+    anchor: Literal["home", "none"] = "none"  # home: the first sample of a tool is where the task has it wait
+
+    def __post_init__(self) -> None:
+        if not self.bird:
+            raise ValueError("a flock needs a table [[minibird.bird]]")
+        for what in ("address", "tool"):
+            found = [getattr(bird, what) for bird in self.bird]
+            if len(set(found)) < len(found):
+                raise ValueError(f"two birds have the same {what}")
+        own = [bird.port for bird in self.bird]
+        if len(set(own)) < len(own) and any(own):
+            raise ValueError("either each bird has a port of its own, or none has one")
+        if any(own) == bool(self.port):
+            raise ValueError("give 'port' for the flock in group mode, or a port to each bird")
+
+
+@dataclass(frozen=True)
+class Jaw:
+    """Two-point calibration of one forceps' closure sensor: its raw counts when open and when closed."""
+
+    tool: Literal["left", "right"]
+    open: float = field(metadata={"bounds": Bounds(0.0, 65535.0)})
+    closed: float = field(metadata={"bounds": Bounds(0.0, 65535.0)})
+
+    def __post_init__(self) -> None:
+        if abs(self.closed - self.open) < 10.0:
+            raise ValueError("'open' and 'closed' must be at least 10 counts apart")
+
+
+@dataclass(frozen=True)
+class ClosureSpec:
+    """The board that measures how far the forceps are closed; devices/closure-sensor/ has its firmware."""
+
+    port: str
+    jaw: tuple[Jaw, ...]
+    baud: int = field(default=115200, metadata={"bounds": Bounds(2400, 4_000_000)})
+
+
+@dataclass(frozen=True)
 class Profile:
     """A device, as its TOML file states it."""
 
     name: str
-    driver: Literal["scripted", "recording"]
+    driver: Literal["scripted", "recording", "minibird"]
     summary: str
     hand: Hand | None = None
     recording: RecordingSpec | None = None
     calibrated_by: str = "newest"  # of the calibrations beside the file; or the name of one of them, or "none"
     calibration: Calibration | None = None  # whose numbers are in effect
+    minibird: MinibirdSpec | None = None
+    closure: ClosureSpec | None = None
 
     def __post_init__(self) -> None:
-        wanted = {"scripted": "hand", "recording": "recording"}[self.driver]
+        wanted = {"scripted": "hand", "recording": "recording", "minibird": "minibird"}[self.driver]
         if getattr(self, wanted) is None:
             raise ValueError(f"driver '{self.driver}' needs a table [{wanted}]")
 

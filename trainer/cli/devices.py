@@ -54,6 +54,54 @@ def check(
         raise typer.Exit(1)
 
 
+@app.command()
+def simulate(
+    profile: Annotated[str, typer.Argument(metavar="PROFILE", help="A device's name or .toml file.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Where the ports and a profile that names them appear.")],
+    motion: Annotated[
+        str, typer.Option(metavar="FILE", help="A tracker's recording (.mha) or PATH.db#SESSION; by default rest.")
+    ] = "",
+    fault: Annotated[
+        list[str] | None, typer.Option(metavar="NAME=VALUE", help="What goes wrong; repeat. See devices/README.md.")
+    ] = None,
+    speed: Annotated[float, typer.Option(min=0.1, max=100.0, help="Times faster than real time.")] = 1.0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the faults' chance.")] = 0,
+) -> None:
+    """Play a profile's devices on pseudo-terminals until Ctrl-C; what to give to --device is printed first."""
+    import signal
+    from types import FrameType
+
+    from trainer import drivers
+    from trainer.config import ConfigError
+    from trainer.simulators import faults
+    from trainer.simulators.hands import open_hands
+    from trainer.simulators.station import Station, with_ports
+
+    file = drivers.open_profile(profile)
+    spec, closure = file.profile.minibird, file.profile.closure
+    if spec is None:
+        raise ConfigError(f"{profile}: only devices of driver 'minibird' can be simulated")
+    trackers, closures = faults.parse(fault or [])
+    hands = open_hands(motion, spec)
+    out = out.absolute()
+    out.mkdir(parents=True, exist_ok=True)
+    ports = [out / "flock"] if spec.port else [out / f"bird{bird.address}" for bird in spec.bird]
+    ports += [out / "closure"] if closure is not None else []
+    station = Station(spec, closure, hands, ports, speed, trackers, closures, seed)
+    written = out / f"{file.profile.name}.toml"
+    written.write_text(with_ports(file.text, ports, hands.in_scene), encoding="utf-8")
+    ended = False
+
+    def end(signum: int, frame: FrameType | None) -> None:
+        nonlocal ended
+        ended = True
+
+    signal.signal(signal.SIGINT, end)
+    signal.signal(signal.SIGTERM, end)
+    print(written, flush=True)
+    print(json.dumps(station.run(lambda: ended)), flush=True)
+
+
 def _check(reference: str) -> dict[str, Any] | None:
     """What the recording behind ``reference`` holds; None for a profile that names none. Raises ConfigError."""
     from trainer import drivers

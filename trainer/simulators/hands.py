@@ -1,0 +1,123 @@
+"""Where simulated sensors are: at rest, as recorded, or as a session's instruments moved."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from trainer.config import ConfigError
+from trainer.drivers import is_logged, sequence_file
+from trainer.geometry import Array, Rigid, quaternion_from_euler_deg, quaternion_multiply, slerp
+from trainer.log import reader
+from trainer.profile import Bird, MinibirdSpec
+
+#: Where sensors rest that nothing moves, mm from the transmitter along the hemisphere's axis (assumed).
+REST_MM = 300.0
+HEMISPHERE_AXIS = {
+    "forward": (0, 1),
+    "aft": (0, -1),
+    "right": (1, 1),
+    "left": (1, -1),
+    "lower": (2, 1),
+    "upper": (2, -1),
+}
+
+
+@dataclass(frozen=True)
+class Hands:
+    """Motion of k sensors, in the order of the profile's birds."""
+
+    time: Array  # (n,) s from the start
+    position: Array  # (n, k, 3) mm, transmitter frame
+    quaternion: Array  # (n, k, 4) wxyz, transmitter_from_sensor
+    closure: Array  # (n, k) of the instrument
+    sampled: bool  # the device measures when the motion was sampled, each sample once
+    in_scene: bool  # the motion is that of instruments in a scene, seen through the profile's mapping
+
+    @property
+    def duration_s(self) -> float:
+        return float(self.time[-1])
+
+    def at(self, time_s: float, bird: int) -> tuple[Rigid, float]:
+        """Pose and closure at ``time_s``; before and after the motion its first and last."""
+        after = int(np.searchsorted(self.time, time_s, side="right"))
+        a, b = max(after - 1, 0), min(after, len(self.time) - 1)
+        span = self.time[b] - self.time[a]
+        share = float(np.clip((time_s - self.time[a]) / span, 0.0, 1.0)) if span > 0.0 and not self.sampled else 0.0
+        if share == 0.0:
+            return Rigid(self.position[a, bird], self.quaternion[a, bird]), float(self.closure[a, bird])
+        position = self.position[a, bird] + share * (self.position[b, bird] - self.position[a, bird])
+        turned = slerp(self.quaternion[a, bird], self.quaternion[b, bird], share)
+        closure = self.closure[a, bird] + share * (self.closure[b, bird] - self.closure[a, bird])
+        return Rigid(position, turned), float(closure)
+
+
+def open_hands(motion: str, spec: MinibirdSpec) -> Hands:
+    """The motion that ``--motion`` names: a tracker's recording, a session of the log, or "" for rest.
+
+    Raises ConfigError, LogError.
+    """
+    if not motion:
+        return _resting(spec)
+    if is_logged(motion):
+        return _logged(motion, spec)
+    sequence = sequence_file.read(motion)
+    tracks = list(sequence.tracks.values())
+    if len(tracks) < len(spec.bird):
+        raise ConfigError(f"{motion}: {len(spec.bird)} birds need as many sensors, found {len(tracks)}")
+    tracks = tracks[: len(spec.bird)]
+    return Hands(
+        time=sequence.time - sequence.time[0],
+        position=np.stack([t.position for t in tracks], axis=1),
+        quaternion=np.stack([t.quaternion for t in tracks], axis=1),
+        closure=np.ones((len(sequence.time), len(tracks))),
+        sampled=True,
+        in_scene=False,
+    )
+
+
+def _resting(spec: MinibirdSpec) -> Hands:
+    k = len(spec.bird)
+    axis, sign = HEMISPHERE_AXIS[spec.hemisphere]
+    position = np.zeros((1, k, 3))
+    position[:, :, axis] = sign * REST_MM
+    position[0, :, (axis + 1) % 3] = 50.0 * np.arange(k)
+    quaternion = np.tile(quaternion_from_euler_deg((30.0, 40.0, 20.0)), (1, k, 1))
+    return Hands(np.zeros(1), position, quaternion, np.zeros((1, k)), sampled=False, in_scene=False)
+
+
+def _logged(motion: str, spec: MinibirdSpec) -> Hands:
+    """A session's instruments as the sensors on them were, by the profile's mapping."""
+    path, _, session = motion.rpartition("#")
+    with reader.open_log(Path(path)) as log:
+        record = reader.load(log, session)
+    missing = [bird.tool for bird in spec.bird if bird.tool not in record.header.tools]
+    if missing:
+        raise ConfigError(f"{motion}: has no instrument '{missing[0]}'")
+    columns = [record.header.tools.index(bird.tool) for bird in spec.bird]
+    n = len(record.position)
+    sensors = [
+        _sensor(record.position[:, c], record.quaternion[:, c], spec, b)
+        for c, b in zip(columns, spec.bird, strict=True)
+    ]
+    return Hands(
+        time=np.arange(n) / record.header.tick_hz,
+        position=np.stack([p for p, _ in sensors], axis=1),
+        quaternion=np.stack([q for _, q in sensors], axis=1),
+        closure=record.closure[:, columns],
+        sampled=False,
+        in_scene=True,
+    )
+
+
+def _sensor(position: Array, quaternion: Array, spec: MinibirdSpec, bird: Bird) -> tuple[Array, Array]:
+    """Sensor poses (n, 3), (n, 4) in the transmitter's frame of tool poses in the scene's."""
+    scene_from_device = Rigid(np.array(spec.position_mm), quaternion_from_euler_deg(spec.rotation_deg))
+    tool_from_sensor = Rigid(np.array(bird.position_mm), quaternion_from_euler_deg(bird.rotation_deg)).inverse()
+    device_from_scene = scene_from_device.inverse()
+    turned = quaternion_multiply(quaternion, tool_from_sensor.quaternion)
+    placed = np.array([Rigid(p, q).apply(tool_from_sensor.position) for p, q in zip(position, quaternion, strict=True)])
+    in_device = quaternion_multiply(device_from_scene.quaternion, turned)
+    return device_from_scene.apply(placed) / spec.scale, in_device
