@@ -87,6 +87,7 @@ def perform(
     from trainer.cli.progress import Progress
     from trainer.cli.warmup import announce, warm_up
     from trainer.drivers import open_driver
+    from trainer.drivers.driver import LiveDriver
     from trainer.metrics.registry import check_targets, score
     from trainer.scene import build
     from trainer.session import interruptible, old_objects_left_alone, run
@@ -114,7 +115,8 @@ def perform(
         sinks.append(stack.enter_context(closing(recording)))
     log = stack.enter_context(closing(LogSink(log_path, header)))
     with closing(Progress(task)) as progress, interruptible() as interrupted, old_objects_left_alone():
-        run(scene, driver, [log, *sinks, progress], clock, lambda: interrupted() or enough())
+        told = [driver] if isinstance(driver, LiveDriver) else []
+        run(scene, driver, [log, *sinks, progress, *told], clock, lambda: interrupted() or enough())
     duration_s = scene.tick / task.tick_hz
     stored = log.record(scene.outcome, scene.tick, duration_s)
     metrics = score(stored, task)

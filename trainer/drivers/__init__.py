@@ -64,7 +64,7 @@ def recording_path(file: ProfileFile) -> str:
 def open_driver(reference: str, task: Task, home: ToolPoses, seed: int) -> tuple[ProfileFile, Driver]:
     """The device ``reference``, ready for a session of ``task``, whose instruments wait at ``home``.
 
-    Raises ConfigError for a profile or recording that cannot be used.
+    Raises ConfigError for a profile or recording that cannot be used, DeviceError for a device that does not answer.
     """
     file = open_profile(reference)
     return file, _driver(file, file.profile, task, home, seed)
@@ -75,8 +75,12 @@ def _driver(file: ProfileFile, profile: Profile, task: Task, home: ToolPoses, se
         from trainer.drivers.scripted import ScriptedHands
 
         return ScriptedHands(profile.hand, task, home, seed)
-    path = recording_path(file)
     tools = [instrument.tool for instrument in task.scene.instrument]
+    if profile.minibird is not None and profile.driver == "minibird":
+        from trainer.drivers.minibird import Minibird
+
+        return Minibird(profile.minibird, profile.closure, tools, task.tick_hz, home)
+    path = recording_path(file)
     if is_logged(path):
         from trainer.drivers.logged import LoggedSession
 

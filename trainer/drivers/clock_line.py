@@ -22,6 +22,7 @@ class ClockLine:
     def __init__(self, period_s: float) -> None:
         self.period_s = period_s  # as fitted
         self._nominal_s = period_s
+        self._newest_s = 0.0  # when the newest sample was due
         self._seen: deque[tuple[int, float]] = deque(maxlen=WINDOW)
         self._residual2 = 0.0  # s², sum over all samples of the session
         self._count = 0
@@ -34,8 +35,7 @@ class ClockLine:
         index = 0
         if self._seen:
             last, last_s = self._seen[-1]
-            steps = (arrived_s - last_s) / self.period_s
-            if not 0.0 <= steps <= BREAK:
+            if arrived_s - last_s > BREAK * self.period_s:
                 self._seen.clear()
                 self.period_s = self._nominal_s
             else:

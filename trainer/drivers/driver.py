@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from trainer.poses import ToolPoses
 
@@ -24,3 +24,10 @@ class Driver(Protocol):
     def close(self) -> None:
         """Give the port or file back."""
         ...
+
+
+@runtime_checkable
+class LiveDriver(Driver, Protocol):
+    """A device in a hand: it is a sink as well, and hears when a tick's events are out, to measure its latency."""
+
+    def tick(self, record: object) -> None: ...

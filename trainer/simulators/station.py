@@ -57,6 +57,7 @@ class Station:
 
     def run(self, ended: Callable[[], bool]) -> dict[str, object]:
         """Until ``ended``; what happened, for whoever asks."""
+        self._cycle_s = time.monotonic()
         while not ended():
             now = time.monotonic()
             self._happen(now)

@@ -1,0 +1,60 @@
+"""Serial ports of devices, by any address that pyserial knows (``/dev/ttyUSB0``, ``socket://``, ``spy://`` …)."""
+
+from __future__ import annotations
+
+import errno
+from typing import Any
+
+import serial
+
+#: A read that gets nothing returns after this long, so that a thread sees soon that it is to end.
+READ_S = 0.05
+WRITE_S = 1.0
+
+
+class DeviceError(Exception):
+    """A device that does not do what it should; the text is one line that names its port."""
+
+
+def open_port(url: str, baud: int) -> Any:
+    """The port, 8N1 without flow control, for this program alone. Raises DeviceError.
+
+    RTS low lets a tracker run and high holds it in reset, DTR low stops its output: both are set before the port is
+    opened, since pyserial would raise both. A pseudo-terminal has neither line; setting them before is no error there.
+    """
+    try:
+        port = serial.serial_for_url(url, do_not_open=True)
+        port.baudrate = baud
+        port.timeout, port.write_timeout = READ_S, WRITE_S
+        port.rts, port.dtr = False, True
+        if isinstance(port, serial.Serial) and hasattr(port, "exclusive"):
+            port.exclusive = True
+        port.open()
+    except (OSError, ValueError) as error:
+        raise DeviceError(f"{url}: {_why(error)}") from None
+    return port
+
+
+def _why(error: OSError | ValueError) -> str:
+    number = error.errno if isinstance(error, OSError) else None
+    if "exclusively lock" in str(error) or number in (errno.EBUSY, errno.EAGAIN):
+        return "in use by another program; end that one first"
+    if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.EIO):
+        return "no such port; plug the device in, or give the profile its port"
+    if number in (errno.EACCES, errno.EPERM):
+        return "not allowed; on Linux join the group 'dialout' and log in again"
+    return f"cannot be opened: {' '.join(str(error).split())}"
+
+
+def set_reset(port: Any, held: bool) -> None:
+    """RTS, where the line has one."""
+    try:
+        port.rts = held
+    except OSError as error:
+        if error.errno != errno.ENOTTY:
+            raise
+
+
+def read_some(port: Any) -> bytes:
+    """What has come, at least one byte unless ``READ_S`` pass without. Raises OSError where the port is gone."""
+    return bytes(port.read(max(1, port.in_waiting)))
