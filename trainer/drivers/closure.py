@@ -123,7 +123,7 @@ class _Watch:
         self._way_mm = 0.0
 
     def moved(self, raw: int, way_mm: float, now_s: float) -> None:
-        if raw != self._raw:
+        if raw != self._raw or now_s - self._seen_s > STUCK_S:  # after a longer loss the account begins anew
             self._raw, self._since_s, self._way_mm = raw, now_s, 0.0
         elif now_s - self._since_s >= STUCK_S and self._way_mm >= STUCK_MM:
             self.stuck_s += now_s - self._seen_s

@@ -6,6 +6,7 @@ counts as not seen: the scene leaves the instrument where it is, jaws and all, a
 
 from __future__ import annotations
 
+import sys
 import time
 from array import array
 from collections.abc import Sequence
@@ -28,6 +29,8 @@ from trainer.profile import Bird, ClosureSpec, MinibirdSpec
 STALE_S = 0.1
 #: The stream's first sample may take this long after the session began.
 FIRST_S = 0.5
+#: How long a thread computes before it lets one that has read something have a turn; 5 ms by default. Assumed.
+SWITCH_S = 0.0005
 #: As many losses are told one by one; a worse session is told by their number.
 MOST_LOSSES = 100
 
@@ -84,6 +87,9 @@ class Minibird:
             if self._closure is not None:
                 self._closure.wait()
             opened.pop_all()
+        # A thread that reads must not wait 5 ms for one that computes.
+        self._switch_s = sys.getswitchinterval()
+        sys.setswitchinterval(SWITCH_S)
 
     def _take(self, sample: Sample) -> None:
         """A sample, on the thread that read it."""
@@ -195,6 +201,7 @@ class Minibird:
         }
 
     def close(self) -> None:
+        sys.setswitchinterval(self._switch_s)
         self._stream.close()
         if self._closure is not None:
             self._closure.close()

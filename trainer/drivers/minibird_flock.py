@@ -20,6 +20,9 @@ from trainer.profile import MinibirdSpec
 
 #: A rotation of less than 8° does not tell a quaternion from its inverse: 1 - cos 8° = 0.01.
 SENSE = 0.01
+#: Angles and quaternion of one bird agree to this cosine of half the angle between them (16°), or bytes were spoilt.
+AGREE = 0.99
+TRIES = 4  # at asking
 #: The most units of a flock with normal addresses.
 MOST = 14
 
@@ -74,10 +77,13 @@ class Flock:
             for address in self._ports:
                 self._hush(address)
                 self._introduce(address)
+                self._say(address, commands.change(commands.GROUP_MODE, b"\x00"))  # as an earlier program left it
             self._configure()
             for address in self._addresses:
                 self._set_up(address)
             if self._spec.port:
+                for address in set(range(1, self._addresses[-1])).difference(self._addresses):
+                    self._say(address, commands.POSITION_QUATERNION)  # all records of a group are of one length
                 self._say(self._master, commands.change(commands.GROUP_MODE, b"\x01"))
             self._check_error()
         except OSError as error:
@@ -122,19 +128,23 @@ class Flock:
         self._ports[address if own else self._master].write(commands.to_bird(None if own else address, command))
 
     def _ask(self, address: int, command: bytes, count: int) -> bytes:
-        """The answer of ``count`` bytes. Raises DeviceError where it does not come."""
-        port = self._ports.get(address, self._ports[self._master])
-        self._say(address, command)
-        answer, ends = b"", time.monotonic() + self._silences.answer_s
-        while len(answer) < count:
-            if time.monotonic() > ends:
-                heard = f"{len(answer)} of {count} bytes" if answer else "nothing"
-                raise DeviceError(
-                    f"{self._urls.get(address, self._url)}: bird {address} answers {heard}; is it on, its switch on "
-                    f"fly, and the baud rate {self._spec.baud} as its switches say?"
-                )
-            answer += port.read(count - len(answer))
-        return answer
+        """The answer of ``count`` bytes, asked for again where bytes of it are lost. Raises DeviceError."""
+        at = address if address in self._ports else self._master
+        for attempt in range(TRIES):
+            self._say(address, command)
+            answer, ends = b"", time.monotonic() + self._silences.answer_s
+            while len(answer) < count and time.monotonic() < ends:
+                answer += self._ports[at].read(count - len(answer))
+            if len(answer) == count:
+                return answer
+            if not answer and not attempt:
+                break  # nobody is there
+            self._drain(at)
+        heard = "less than asked for" if answer else "nothing"
+        raise DeviceError(
+            f"{self._urls[at]}: bird {address} answers {heard}; is it on, its switch on fly, and the baud rate "
+            f"{self._spec.baud} as its switches say?"
+        )
 
     def _hush(self, address: int) -> None:
         """End a stream that another program left running, and drop what is still on its way."""
@@ -168,6 +178,8 @@ class Flock:
 
     def _configure(self) -> None:
         found = self._birds()
+        if any(not found[address - 1].accessible for address in self._addresses):
+            found = self._birds()  # a spoilt byte says the same as a bird that is not there
         missing = [a for a in range(1, self._addresses[-1] + 1) if not found[a - 1].accessible]
         if missing:
             raise DeviceError(
@@ -203,18 +215,19 @@ class Flock:
 
     def _sense(self, address: int) -> bool:
         """Whether a bird's quaternion is that of the inverse of the rotation that its angles say."""
-        self._say(address, commands.POSITION_ANGLES)
-        azimuth, elevation, roll = np.array(decode(self._ask(address, commands.POINT, 12))[3:]) * (180.0 / 32768.0)
-        by_angles = quaternion_from_euler_deg((roll, elevation, azimuth))
-        self._say(address, commands.POSITION_QUATERNION)
-        sent: Array = np.array(decode(self._ask(address, commands.POINT, 2 * WORDS))[3:]) / 32768.0
-        direct, inverse = abs(float(sent @ by_angles)), abs(float(quaternion_conjugate(sent) @ by_angles))
-        if abs(direct - inverse) < SENSE:
-            raise DeviceError(
-                f"{self._url}: bird {address} lies too straight to tell the sense of its quaternions; tilt it by 20° "
-                "and start again, or set 'quaternion' to direct or inverse"
-            )
-        return inverse > direct
+        for _ in range(TRIES):
+            self._say(address, commands.POSITION_ANGLES)
+            azimuth, elevation, roll = np.array(decode(self._ask(address, commands.POINT, 12))[3:]) * (180.0 / 32768.0)
+            by_angles = quaternion_from_euler_deg((roll, elevation, azimuth))
+            self._say(address, commands.POSITION_QUATERNION)
+            sent: Array = np.array(decode(self._ask(address, commands.POINT, 2 * WORDS))[3:]) / 32768.0
+            direct, inverse = abs(float(sent @ by_angles)), abs(float(quaternion_conjugate(sent) @ by_angles))
+            if max(direct, inverse) > AGREE and abs(direct - inverse) >= SENSE:
+                return inverse > direct
+        raise DeviceError(
+            f"{self._url}: bird {address} lies too straight to tell the sense of its quaternions; tilt it by 20° and "
+            "start again, or set 'quaternion' to direct or inverse"
+        )
 
     def _check_error(self) -> None:
         code = self._ask(self._master, commands.examine(commands.ERROR), 1)[0]

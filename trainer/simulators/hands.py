@@ -27,8 +27,9 @@ HEMISPHERE_AXIS = {
 
 @dataclass(frozen=True)
 class Hands:
-    """Motion of k sensors, in the order of the profile's birds."""
+    """Motion of the k sensors of a flock."""
 
+    addresses: tuple[int, ...]  # of their birds: all from 1 to the profile's highest, which a flock needs
     time: Array  # (n,) s from the start
     position: Array  # (n, k, 3) mm, transmitter frame
     quaternion: Array  # (n, k, 4) wxyz, transmitter_from_sensor
@@ -59,16 +60,18 @@ def open_hands(motion: str, spec: MinibirdSpec) -> Hands:
 
     Raises ConfigError, LogError.
     """
+    addresses = tuple(range(1, max(bird.address for bird in spec.bird) + 1))
     if not motion:
-        return _resting(spec)
+        return _resting(spec, addresses)
     if is_logged(motion):
-        return _logged(motion, spec)
+        return _logged(motion, spec, addresses)
     sequence = sequence_file.read(motion)
     tracks = list(sequence.tracks.values())
-    if len(tracks) < len(spec.bird):
-        raise ConfigError(f"{motion}: {len(spec.bird)} birds need as many sensors, found {len(tracks)}")
-    tracks = tracks[: len(spec.bird)]
+    if len(tracks) < len(addresses):
+        raise ConfigError(f"{motion}: {len(addresses)} birds need as many sensors, found {len(tracks)}")
+    tracks = tracks[: len(addresses)]
     return Hands(
+        addresses=addresses,
         time=sequence.time - sequence.time[0],
         position=np.stack([t.position for t in tracks], axis=1),
         quaternion=np.stack([t.quaternion for t in tracks], axis=1),
@@ -78,17 +81,17 @@ def open_hands(motion: str, spec: MinibirdSpec) -> Hands:
     )
 
 
-def _resting(spec: MinibirdSpec) -> Hands:
-    k = len(spec.bird)
+def _resting(spec: MinibirdSpec, addresses: tuple[int, ...]) -> Hands:
+    k = len(addresses)
     axis, sign = HEMISPHERE_AXIS[spec.hemisphere]
     position = np.zeros((1, k, 3))
     position[:, :, axis] = sign * REST_MM
     position[0, :, (axis + 1) % 3] = 50.0 * np.arange(k)
     quaternion = np.tile(quaternion_from_euler_deg((30.0, 40.0, 20.0)), (1, k, 1))
-    return Hands(np.zeros(1), position, quaternion, np.zeros((1, k)), sampled=False, in_scene=False)
+    return Hands(addresses, np.zeros(1), position, quaternion, np.zeros((1, k)), sampled=False, in_scene=False)
 
 
-def _logged(motion: str, spec: MinibirdSpec) -> Hands:
+def _logged(motion: str, spec: MinibirdSpec, addresses: tuple[int, ...]) -> Hands:
     """A session's instruments as the sensors on them were, by the profile's mapping."""
     path, _, session = motion.rpartition("#")
     with reader.open_log(Path(path)) as log:
@@ -96,13 +99,16 @@ def _logged(motion: str, spec: MinibirdSpec) -> Hands:
     missing = [bird.tool for bird in spec.bird if bird.tool not in record.header.tools]
     if missing:
         raise ConfigError(f"{motion}: has no instrument '{missing[0]}'")
-    columns = [record.header.tools.index(bird.tool) for bird in spec.bird]
+    birds = {bird.address: bird for bird in spec.bird}
+    # A bird that moves no instrument of the profile goes along with the first that does.
+    moved = [birds.get(address, spec.bird[0]) for address in addresses]
+    columns = [record.header.tools.index(bird.tool) for bird in moved]
     n = len(record.position)
     sensors = [
-        _sensor(record.position[:, c], record.quaternion[:, c], spec, b)
-        for c, b in zip(columns, spec.bird, strict=True)
+        _sensor(record.position[:, c], record.quaternion[:, c], spec, b) for c, b in zip(columns, moved, strict=True)
     ]
     return Hands(
+        addresses=addresses,
         time=np.arange(n) / record.header.tick_hz,
         position=np.stack([p for p, _ in sensors], axis=1),
         quaternion=np.stack([q for _, q in sensors], axis=1),

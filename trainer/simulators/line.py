@@ -14,8 +14,10 @@ from trainer.simulators.faults import Faults
 
 CHUNKS = (1, 7, 16, 62)
 BUNCH_S = 0.016  # the latency timer of a common USB adapter
-#: More than this waiting to be sent is lost, as in a UART that overruns.
+#: A device that says more than its line can carry is cut off at so many writes, …
 MOST_WAITING = 20_000
+#: … and a host that does not read loses what goes beyond the terminal's own 20 kB by so many bytes.
+MOST_LATE = 64_000
 
 
 class Line:
@@ -32,6 +34,7 @@ class Line:
         self._faults = faults
         self._rng = rng
         self._waiting: deque[tuple[float, bytes]] = deque()  # when the last byte of each piece is out
+        self._late = b""  # what was due when the terminal was full
         self._free_s = 0.0  # when the line has sent what it was given
         self._master = self._slave = -1
         self.plug()
@@ -59,6 +62,7 @@ class Line:
         os.close(self._slave)
         self._master = self._slave = -1
         self._waiting.clear()
+        self._late = b""
 
     def read(self) -> bytes:
         """What the host has written; noise where its baud rate is another."""
@@ -88,15 +92,15 @@ class Line:
             start = end
 
     def pump(self, now_s: float) -> None:
-        """Hand over what is due; what the host does not take is lost."""
-        due = bytearray()
-        while self._waiting and self._waiting[0][0] <= now_s:
-            due += self._waiting.popleft()[1]
-        if due and self.plugged:
+        """Hand over what is due; a host that takes nothing for long loses what no longer fits."""
+        while self._waiting and self._waiting[0][0] <= now_s and self.plugged:
+            self._late += self._waiting.popleft()[1]
+        if self._late and self.plugged:
             try:
-                os.write(self._master, due)
+                taken = os.write(self._master, self._late)
             except OSError:
-                return
+                taken = 0
+            self._late = self._late[taken:][:MOST_LATE]
 
     def next_s(self) -> float:
         """When the next bytes are due; infinity where none wait."""

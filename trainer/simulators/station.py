@@ -37,8 +37,8 @@ class Station:
     ) -> None:
         self._hands, self._speed, self._faults, self._closure_faults = hands, speed, faults, closure_faults
         self._rng = np.random.default_rng(seed)
-        self._birds = {bird.address: k for k, bird in enumerate(spec.bird)}
-        self._tools = [bird.tool for bird in spec.bird]
+        self._birds = {address: k for k, address in enumerate(hands.addresses)}
+        self._tools = {bird.address: bird.tool for bird in spec.bird}
         present = [a for a in self._birds if a != faults.no_bird]
         self._flock = Flock(present, self._pose, SILENCE_S / speed)
         own = [bird.address for bird in spec.bird] if not spec.port else [min(self._birds)]
@@ -148,7 +148,7 @@ class Station:
             self._closure_s = now
             self._closure_line.send(BOOT, now)
         t, faults = self._motion_s(now), self._closure_faults
-        closure: dict[str, float] = {tool: self._hands.at(t, k)[1] for k, tool in enumerate(self._tools)}
+        closure: dict[str, float] = {tool: self._hands.at(t, self._birds[a])[1] for a, tool in self._tools.items()}
         line = self._board.line(t, closure, faults.stuck.holds(t), faults.out_of_range.holds(t))
         if not faults.pause.holds(t):
             self._closure_line.send(line, self._closure_s)
