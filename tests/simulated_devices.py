@@ -14,7 +14,7 @@ from trainer.drivers.minibird_flock import Silences
 from trainer.profile import Profile, load_profile
 
 #: Times faster than real time; the units' silences are shortened less, since a busy machine keeps no short ones.
-SPEED = 20.0
+SPEED = 10.0
 SHORT = Silences(reset_s=0.1, hold_s=0.05, configure_s=0.15, drain_s=0.05, answer_s=1.0)
 
 

@@ -1,6 +1,6 @@
 """miniBIRDs through bytes, a pseudo-terminal and pyserial: every pose arrives, every fault is survived or told.
 
-The devices are processes of their own. What they do is timed in seconds of motion, twenty to one of the clock's.
+The devices are processes of their own. What they do is timed in seconds of motion, ten to one of the clock's.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from simulated_devices import SHORT, SPEED, loaded, simulated
 
 from trainer.config import ConfigError
 from trainer.drivers import sequence_file
+from trainer.drivers.closure import OUT_OF_RANGE, SILENT
 from trainer.drivers.minibird import Minibird
 from trainer.drivers.minibird_flock import Flock
 from trainer.drivers.minibird_record import MIRROR, Sample
@@ -34,6 +35,7 @@ needs_real = pytest.mark.skipif(not REAL.exists(), reason=f"the real recording {
 
 TOOLS = ("left", "right")
 HOME = ToolPoses(np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]), np.eye(4)[[0, 0]], np.ones(2), np.ones(2, dtype=bool))
+TICK_HZ = 200.0  # ten times slower than the devices, so that a busy machine can follow; the newest pose wins
 PATIENCE_S = 60.0  # on a machine with everything else to do; nothing waits so long on an idle one
 
 
@@ -50,7 +52,7 @@ def spec_of(profile: Profile) -> MinibirdSpec:
 
 
 def opened(profile: Profile) -> Minibird:
-    return Minibird(spec_of(profile), profile.closure, TOOLS, 100.0 * SPEED, HOME, SHORT)
+    return Minibird(spec_of(profile), profile.closure, TOOLS, TICK_HZ, HOME, SHORT)
 
 
 class Polling:
@@ -74,7 +76,7 @@ class Polling:
             np.testing.assert_array_equal(poses.position[lost], self.last.position[lost])
             np.testing.assert_array_equal(poses.closure[lost], self.last.closure[lost])
             self.last = poses
-            if seen(poses) and (told is None or (self.ticks % 200 == 0 and told(self.summary()))):
+            if seen(poses) and (told is None or (self.ticks % 20 == 0 and told(self.summary()))):
                 return
             assert time.monotonic() < ends, f"{self.summary()}"
 
@@ -86,12 +88,19 @@ def all_seen(poses: ToolPoses) -> bool:
     return bool(poses.valid.all())
 
 
+def said(summary: dict[str, Any], *reasons: str) -> bool:
+    """Whether both instruments were lost, and are back, with all of ``reasons`` at least once."""
+    return all(
+        any(loss["tool"] == t and r in loss["reason"] for loss in summary["lost"]) for t in TOOLS for r in reasons
+    )
+
+
 def none_seen(poses: ToolPoses) -> bool:
     return not poses.valid.any()
 
 
 @needs_real
-@pytest.mark.parametrize("speed", [SPEED, *([1.0] if os.environ.get("TRAINER_LONG") else [])])
+@pytest.mark.parametrize("speed", [20.0, *([1.0] if os.environ.get("TRAINER_LONG") else [])])
 def test_every_position_of_the_real_recording_arrives(tmp_path: Path, speed: float) -> None:
     """5000 frames of three sensors, in order. Positions lie on the tracker's own grid of 36 in / 8192, printed with
     six digits (0.5 µm), so the words lose nothing: they come back as the recording's text has them within 1 µm.
@@ -138,7 +147,7 @@ def test_a_session_of_poses_comes_through_and_its_summary_tells(healthy: Profile
     summary = polling.summary()
     assert summary["driver"] == "minibird"
     assert set(summary["records"]) <= {"good", "dropped bytes", "first after dropped bytes"}
-    assert summary["restarts"] == 0, summary
+    assert summary["restarts"] == 0, f"{summary}"
 
 
 def test_the_sense_of_quaternions_is_found_by_comparing_with_angles(healthy: Profile) -> None:
@@ -185,55 +194,38 @@ def persistent(profile: Profile) -> Minibird:
 
 
 def test_a_power_cycle_and_an_unplugged_cable_are_survived(tmp_path: Path) -> None:
-    """Power is off from 20 s to 30 s of motion, the cable from 100 s for 5 s of the clock's: each is one loss of both
-    instruments, with its reason, and each time the flock is configured anew and they are back."""
-    faults = ("power-cycle=20:10", f"unplug=150:{5 * SPEED / 5:g}")
+    """Power is off from 10 s to 15 s of motion, the cable is out for 5 s of the clock's: the instruments are lost with
+    the reason, the flock is configured anew, and they are back."""
+    faults = ("power-cycle=10:5", f"unplug=40:{5 * SPEED:g}")
     with simulated(tmp_path, *(a for f in faults for a in ("--fault", f))) as path:
         driver = opened(loaded(path))
         polling = Polling(driver)
-        for _ in range(2):
-            polling.until(all_seen)
-            polling.until(none_seen)
-        polling.until(all_seen, lambda summary: summary["restarts"] == 2)
+        polling.until(all_seen, lambda summary: said(summary, "is silent"))
+        polling.until(all_seen, lambda summary: said(summary, "the port is gone", "no such port"))
         driver.close()
-    lost = polling.summary()["lost"]
-    assert isinstance(lost, list)
-    assert {loss["tool"] for loss in lost} == set(TOOLS)
-    reasons = " ".join(loss["reason"] for loss in lost)
-    assert "silent" in reasons or "no sample" in reasons
-    assert "no such port" in reasons or "gone" in reasons
+    assert polling.summary()["restarts"] >= 2
 
 
 def test_a_pause_and_another_hemisphere_freeze_without_a_restart(tmp_path: Path) -> None:
     """A pause of 0.2 s of the clock and 0.5 s with every position's sign changed."""
-    faults = ("pause=20:4", "hemisphere=40:10")
+    faults = ("pause=10:2", "hemisphere=20:5")
     with simulated(tmp_path, *(a for f in faults for a in ("--fault", f))) as path:
         driver = opened(loaded(path))
         polling = Polling(driver)
-        for _ in range(2):
-            polling.until(all_seen)
-            polling.until(none_seen)
-        polling.until(all_seen)
+        polling.until(all_seen, lambda summary: said(summary, MIRROR))
         driver.close()
     summary = polling.summary()
-    assert MIRROR in [loss["reason"] for loss in summary["lost"]]
     assert summary["records"][MIRROR] > 10
 
 
 def test_a_closure_sensor_that_says_nothing_or_nonsense_freezes_its_jaws(tmp_path: Path) -> None:
-    faults = ("closure:pause=20:10", "closure:out-of-range=60:10", "closure:unplug=100:20")
+    faults = ("closure:pause=10:5", "closure:out-of-range=20:5", "closure:unplug=30:10")
     with simulated(tmp_path, *(a for f in faults for a in ("--fault", f))) as path:
         driver = opened(loaded(path))
         polling = Polling(driver)
-        for _ in range(3):
-            polling.until(all_seen)
-            polling.until(none_seen)
-        polling.until(all_seen)
+        polling.until(all_seen, lambda summary: said(summary, SILENT) and said(summary, OUT_OF_RANGE))
+        polling.until(all_seen, lambda summary: summary["closure"]["reopened"] == 1)
         driver.close()
-    summary = polling.summary()
-    reasons = {loss["reason"] for loss in summary["lost"]}
-    assert reasons >= {"closure sensor silent", "closure sensor out of range"}
-    assert summary["closure"]["reopened"] == 1
 
 
 @pytest.mark.parametrize(
@@ -256,7 +248,7 @@ def test_a_stream_that_never_starts_is_told_and_tried_again(tmp_path: Path) -> N
         polling.until(none_seen)
         polling.until(none_seen, lambda summary: summary["restarts"] >= 1)
         driver.close()
-    assert [loss["reason"] for loss in polling.summary()["lost"]] == ["bird 1 is silent"] * 2
+    assert said(polling.summary(), "bird 1 is silent")
 
 
 def test_a_wrong_baud_rate_is_one_line(healthy: Profile) -> None:
@@ -331,7 +323,7 @@ def test_a_bird_with_a_port_of_its_own_needs_no_group_mode(tmp_path: Path) -> No
         f'[[minibird.bird]]\naddress = {a}\ntool = "{t}"\nport = "p{a}"\n' for a, t in [(1, "left"), (2, "right")]
     )
     profile.write_text(f'name = "own-ports"\ndriver = "minibird"\nsummary = ""\n[minibird]\n{birds}')
-    with simulated(tmp_path / "out", "--fault", "pause=20:20", profile=str(profile)) as path:
+    with simulated(tmp_path / "out", "--fault", "pause=10:10", profile=str(profile)) as path:
         driver = opened(loaded(path))
         polling = Polling(driver)
         polling.until(all_seen)

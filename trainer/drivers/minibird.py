@@ -11,7 +11,7 @@ import time
 from array import array
 from collections.abc import Sequence
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -33,6 +33,7 @@ FIRST_S = 0.5
 SWITCH_S = 0.0005
 #: As many losses are told one by one; a worse session is told by their number.
 MOST_LOSSES = 100
+MOST_REASONS = 4  # of one loss
 
 
 @dataclass
@@ -46,7 +47,7 @@ class _Instrument:
     used: Sample | None = None
     anchor: Rigid | None = None
     lost_tick: int | None = None
-    reason: str = ""
+    reasons: list[str] = field(default_factory=list)  # why, as far as it is known by now
 
 
 class Minibird:
@@ -164,10 +165,12 @@ class Minibird:
     def _note(self, instrument: _Instrument, tick: int, reason: str) -> None:
         """Keep account of when and why an instrument was lost."""
         if reason and instrument.lost_tick is None:
-            instrument.lost_tick = tick
+            instrument.lost_tick, instrument.reasons = tick, []
         if reason:
-            instrument.reason = reason  # the last word is the wisest: first nothing comes, then it turns out why
-        elif not reason and instrument.lost_tick is not None:
+            # First nothing comes, then it turns out why.
+            if reason not in instrument.reasons and len(instrument.reasons) < MOST_REASONS:
+                instrument.reasons.append(reason)
+        elif instrument.lost_tick is not None:
             self._lost_count += 1
             if len(self._losses) < MOST_LOSSES:
                 self._losses.append(_loss(instrument, tick - instrument.lost_tick, self._tick_s))
@@ -212,5 +215,5 @@ def _loss(instrument: _Instrument, ticks: int, tick_s: float) -> dict[str, objec
         "tool": instrument.bird.tool,
         "tick": instrument.lost_tick,
         "lost_s": round(ticks * tick_s, 3),
-        "reason": instrument.reason,
+        "reason": "; ".join(instrument.reasons),
     }

@@ -61,6 +61,13 @@ class Flock:
         self._master = self._addresses[0]
         self._urls = {b.address: b.port for b in spec.bird} if not spec.port else {self._master: spec.port}
         self._ports: dict[int, Any] = {}  # by the address of the unit that is plugged in there
+        group = bool(spec.port)
+        everyone = tuple(range(1, self._addresses[-1] + 1))
+        #: Of what comes at each port. They last as long as the flock: where a bird was before a loss tells whether it
+        #: is on the other side of its hemisphere afterwards.
+        self.parsers = {
+            address: RecordParser(everyone if group else (address,), group, 10.0 / spec.baud) for address in self._urls
+        }
         self.inverse: dict[int, bool] = {}  # birds whose quaternions are those of the inverse rotation
 
     def connect(self) -> None:
@@ -75,7 +82,6 @@ class Flock:
                     self._pause(seconds)
             self._pause(self._silences.reset_s)
             for address in self._ports:
-                self._hush(address)
                 self._introduce(address)
                 self._say(address, commands.change(commands.GROUP_MODE, b"\x00"))  # as an earlier program left it
             self._configure()
@@ -95,15 +101,10 @@ class Flock:
 
     def begin(self) -> dict[int, tuple[Any, RecordParser]]:
         """Start the stream; ports with the parser of what comes. Raises OSError where a port is gone."""
-        byte_s = 10.0 / self._spec.baud
-        group = bool(self._spec.port)
-        everyone = tuple(range(1, self._addresses[-1] + 1))
         for address in self._ports:
+            self.parsers[address].begin()
             self._say(address, commands.STREAM)
-        return {
-            address: (port, RecordParser(everyone if group else (address,), group, byte_s))
-            for address, port in self._ports.items()
-        }
+        return {address: (port, self.parsers[address]) for address, port in self._ports.items()}
 
     def disconnect(self) -> None:
         """Stop the stream, have the transmitter rest and close the ports, as far as they are still there."""
@@ -147,7 +148,7 @@ class Flock:
         )
 
     def _hush(self, address: int) -> None:
-        """End a stream that another program left running, and drop what is still on its way."""
+        """End a stream that was left running, and drop what is still on its way."""
         self._say(address, commands.STREAM_STOP)
         self._say(address, commands.POINT)
         self._drain(address)
@@ -164,9 +165,13 @@ class Flock:
     def _introduce(self, address: int) -> None:
         """Two looks at the status word must agree, whatever is at the port. Its error bit is cleared by the first."""
         ask = commands.examine(commands.STATUS)
-        first, second = (self._ask(address, ask, 2) for _ in range(2))
         url = self._urls[address]
-        if first[0] != second[0] or (first[1] ^ second[1]) & 0xDF:
+        for _ in range(TRIES):
+            self._hush(address)
+            first, second = (self._ask(address, ask, 2) for _ in range(2))
+            if first[0] == second[0] and not (first[1] ^ second[1]) & 0xDF:
+                break
+        else:
             raise DeviceError(f"{url}: no tracker's answers; check the port and the baud rate {self._spec.baud}")
         status = commands.UnitStatus.read(second)
         if status.expanded:

@@ -112,6 +112,13 @@ class RecordParser:
         self._length = 2 * WORDS + self.group
         self._birds = {address: _Bird() for address in self.addresses}
 
+    def begin(self) -> None:
+        """A stream begins: what was half read before it is forgotten, where the birds were is not."""
+        self._drop(len(self._record))
+        self._record = bytearray()
+        self._dropped = False
+        self._before = None
+
     def feed(self, data: bytes, time_s: float) -> list[Sample]:
         """The samples that ``data``, read at ``time_s`` (s, any clock), completes. Never raises."""
         out = []

@@ -41,8 +41,6 @@ class FlockStream:
         self._failed = threading.Event()
         self._flock = Flock(spec, silences, self._pause)
         self._heard_s: dict[int, float] = {}  # when a bird last said something believable
-        self._counts: Counter[str] = Counter()
-        self._parsers: list[RecordParser] = []
         self._keeper: threading.Thread | None = None
         self.trouble = ""  # why nothing comes now
         self.restarts = 0
@@ -56,7 +54,7 @@ class FlockStream:
     @property
     def counts(self) -> Counter[str]:
         """Samples by flaw, "good" ones and "dropped bytes", of the whole session."""
-        return sum((parser.counts for parser in self._parsers), self._counts.copy())
+        return sum((parser.counts for parser in self._flock.parsers.values()), Counter())
 
     def start(self) -> None:
         self._keeper = threading.Thread(target=self._keep, name="flock", daemon=True)
@@ -102,7 +100,6 @@ class FlockStream:
             return
         self._failed.clear()
         self._heard_s = dict.fromkeys(self._addresses, time.monotonic())
-        self._parsers = [parser for _, parser in lines.values()]
         readers = [threading.Thread(target=self._read, args=line, name="bird", daemon=True) for line in lines.values()]
         for reader in readers:
             reader.start()
@@ -114,7 +111,6 @@ class FlockStream:
         self._failed.set()
         for reader in readers:
             reader.join()
-        self._counts, self._parsers = self.counts, []
         if self._stop.is_set():
             raise _Ended
 
