@@ -15,6 +15,9 @@ from trainer.profile import Bird, MinibirdSpec
 
 #: Where sensors rest that nothing moves, mm from the transmitter along the hemisphere's axis (assumed).
 REST_MM = 300.0
+#: A session ends in the tick in which its last goal is reached, its hands still on the way there. They go on as they
+#: moved in their last tenth of a second for so long, s: who plays them again may need a little more of it.
+FOLLOW_THROUGH_S = 1.0
 HEMISPHERE_AXIS = {
     "forward": (0, 1),
     "aft": (0, -1),
@@ -103,16 +106,20 @@ def _logged(motion: str, spec: MinibirdSpec, addresses: tuple[int, ...]) -> Hand
     # A bird that moves no instrument of the profile goes along with the first that does.
     moved = [birds.get(address, spec.bird[0]) for address in addresses]
     columns = [record.header.tools.index(bird.tool) for bird in moved]
-    n = len(record.position)
+    n, hz = len(record.position), record.header.tick_hz
     sensors = [
         _sensor(record.position[:, c], record.quaternion[:, c], spec, b) for c, b in zip(columns, moved, strict=True)
     ]
+    position = np.stack([p for p, _ in sensors], axis=1)
+    quaternion = np.stack([q for _, q in sensors], axis=1)
+    before = max(0, n - 1 - round(0.1 * hz))
+    velocity = (position[-1] - position[before]) * hz / max(1, n - 1 - before)
     return Hands(
         addresses=addresses,
-        time=np.arange(n) / record.header.tick_hz,
-        position=np.stack([p for p, _ in sensors], axis=1),
-        quaternion=np.stack([q for _, q in sensors], axis=1),
-        closure=record.closure[:, columns],
+        time=np.append(np.arange(n) / hz, (n - 1) / hz + FOLLOW_THROUGH_S),
+        position=np.append(position, position[-1:] + FOLLOW_THROUGH_S * velocity, axis=0),
+        quaternion=np.append(quaternion, quaternion[-1:], axis=0),
+        closure=np.append(record.closure[:, columns], record.closure[-1:, columns], axis=0),
         sampled=False,
         in_scene=True,
     )
