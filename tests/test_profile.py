@@ -47,3 +47,50 @@ def test_the_largest_seed_is_taken() -> None:
     hand = profile.parse_profile(HAND + f"seed = {2**63 - 1}", "d.toml").hand
     assert hand is not None
     assert hand.seed == 2**63 - 1
+
+
+FLOCK = 'name = "x"\ndriver = "minibird"\nsummary = "x"\n[minibird]\n'
+BIRDS = "".join(f'[[minibird.bird]]\naddress = {a}\ntool = "{t}"\n' for a, t in ((1, "left"), (2, "right")))
+CLOSURE = '[closure]\nport = "c"\n[[closure.jaw]]\ntool = "left"\nopen = 100\nclosed = 105\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (FLOCK + "bird = []", r"a flock needs a table \[\[minibird\.bird\]\]"),
+        (FLOCK + BIRDS, "give 'port' for the flock in group mode, or a port to each bird"),
+        (FLOCK + 'port = "p"\n' + BIRDS.replace("2", "1"), "two birds have the same address"),
+        (FLOCK + 'port = "p"\n' + BIRDS.replace("right", "left"), "two birds have the same tool"),
+        (FLOCK + BIRDS + 'port = "p"\n', "either each bird has a port of its own, or none has one"),
+        (FLOCK + 'port = "p"\n' + BIRDS.replace("2", "15"), r"'minibird\.bird\[1\]\.address' must be >= 1 and <= 14"),
+        (FLOCK + 'port = "p"\nrate_hz = 200\n' + BIRDS, r"'minibird\.rate_hz' must be >= 20 and <= 144, found 200"),
+        (FLOCK + 'port = "p"\n' + BIRDS + CLOSURE, "'open' and 'closed' must be at least 10 counts apart"),
+    ],
+)
+def test_a_flock_that_cannot_be_is_refused_in_one_line(text: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        profile.parse_profile(text, "x.toml")
+
+
+def test_a_calibration_places_the_sensors_and_the_scene_of_a_flock() -> None:
+    measured = """
+[calibration]
+date = "2026-01-31T12:00:00+00:00"
+[calibration.scene]
+position_mm = [1.0, 2.0, 3.0]
+rotation_deg = [0.0, 0.0, 90.0]
+residual_mm = 0.1
+points = 4
+[[calibration.tip]]
+sensor = "bird2"
+position_mm = [0.0, 0.0, 42.0]
+residual_mm = 0.1
+uncertainty_mm = 0.1
+poses = 100
+"""
+    spec = profile.parse_profile(FLOCK + 'port = "p"\n' + BIRDS + measured, "x.toml").minibird
+    assert spec is not None
+    assert spec.position_mm == (1.0, 2.0, 3.0)
+    assert [bird.position_mm for bird in spec.bird] == [(0.0, 0.0, 0.0), (0.0, 0.0, 42.0)]
+    with pytest.raises(ConfigError, match="of a sensor 'bird7'"):
+        profile.parse_profile(FLOCK + 'port = "p"\n' + BIRDS + measured.replace("bird2", "bird7"), "x.toml")

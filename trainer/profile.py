@@ -97,6 +97,7 @@ class MinibirdSpec:
     position_mm: Vector = field(default=(0.0, 0.0, 0.0), metadata=POSITION_MM)
     rotation_deg: Vector = field(default=(0.0, 0.0, 0.0), metadata=ANGLE_DEG)  # about x, then y, then z
     anchor: Literal["home", "none"] = "none"  # home: the first sample of a tool is where the task has it wait
+    distortion: Distortion | None = None  # of the transmitter's field; usually from a calibration
 
     def __post_init__(self) -> None:
         if not self.bird:
@@ -106,7 +107,7 @@ class MinibirdSpec:
             if len(set(found)) < len(found):
                 raise ValueError(f"two birds have the same {what}")
         own = [bird.port for bird in self.bird]
-        if len(set(own)) < len(own) and any(own):
+        if any(own) and (not all(own) or len(set(own)) < len(own)):
             raise ValueError("either each bird has a port of its own, or none has one")
         if any(own) == bool(self.port):
             raise ValueError("give 'port' for the flock in group mode, or a port to each bird")
@@ -175,6 +176,8 @@ def parse_profile(text: str, name: str) -> Profile:
 def _calibrated(profile: Profile, name: str) -> Profile:
     """The profile with what was measured in the place of what it states itself."""
     measured, spec = profile.calibration, profile.recording
+    if measured is not None and profile.minibird is not None:
+        return replace(profile, minibird=_calibrated_flock(profile.minibird, measured, name))
     if measured is None or spec is None:
         return profile
     tips = {tip.sensor: tip.position_mm for tip in measured.tip}
@@ -187,6 +190,18 @@ def _calibrated(profile: Profile, name: str) -> Profile:
     if measured.distortion is not None:
         spec = replace(spec, distortion=measured.distortion)
     return replace(profile, recording=spec)
+
+
+def _calibrated_flock(spec: MinibirdSpec, measured: Calibration, name: str) -> MinibirdSpec:
+    """The flock's mapping as it was measured; its sensors are called ``bird1``, ``bird2`` …"""
+    tips = {tip.sensor: tip.position_mm for tip in measured.tip}
+    if unknown := set(tips).difference(f"bird{b.address}" for b in spec.bird):
+        raise ConfigError(f"{name}: the calibration is of a sensor '{min(unknown)}', which the profile does not have")
+    birds = tuple(replace(b, position_mm=tips.get(f"bird{b.address}", b.position_mm)) for b in spec.bird)
+    spec = replace(spec, bird=birds, distortion=measured.distortion or spec.distortion)
+    if measured.scene is None:
+        return spec
+    return replace(spec, position_mm=measured.scene.position_mm, rotation_deg=measured.scene.rotation_deg)
 
 
 def profile_names() -> list[str]:

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from trainer.config import ConfigError
+from trainer.drivers import field_distortion
 from trainer.drivers.clock_line import ClockLine
 from trainer.drivers.closure import ClosureSensor
 from trainer.drivers.minibird_flock import UNHURRIED, Silences
@@ -153,7 +154,8 @@ class Minibird:
         turn = np.array(sample.quaternion)
         if self._stream.inverse[bird.address]:
             turn = quaternion_conjugate(turn)
-        device_from_sensor = Rigid(self._spec.scale * np.array(sample.position), turn)
+        position = field_distortion.correct(np.array([sample.position]), self._spec.distortion)[0]
+        device_from_sensor = Rigid(self._spec.scale * position, turn)
         sensor_from_tool = Rigid(np.array(bird.position_mm), quaternion_from_euler_deg(bird.rotation_deg))
         pose = self._scene_from_device @ device_from_sensor @ sensor_from_tool
         if self._spec.anchor == "none":
