@@ -15,6 +15,7 @@ WINDOW = 206
 FADE = 1.0 - 1.0 / WINDOW
 #: From so many samples on the period is fitted, too.
 ENOUGH = 10
+CATCH_UP = 8
 #: A sample so many periods after the last begins a new line (pause, power cycle).
 BREAK = 50
 
@@ -34,18 +35,20 @@ class ClockLine:
         self._newest_s = time_s  # when the newest sample arrived
         self._due_s = time_s  # when it was due
         self._seen = 0
+        self._late: list[float] = []  # by how many periods the last samples came after their time, if all of them did
         # Weighted sums of 1, i, t, i² and i t, relative to the newest sample.
         self._n = self._i = self._t = self._ii = self._it = 0.0
 
     def observe(self, arrived_s: float) -> float:
         """The time (s) at which the sample that arrived at ``arrived_s`` is due on the line.
 
-        Samples that were lost on the way are counted by the time that passed, never by fewer than one.
+        A late sample may have waited in the adapter with those after it, which then catch up, or others before it may
+        be lost, and then none does: so many are counted as lost when ``CATCH_UP`` in a row were late.
         """
         if self._seen == 0 or arrived_s - self._newest_s > BREAK * self.period_s:
             self._begin(arrived_s)
         else:
-            self._shift(max(1, round((arrived_s - self._due_s) / self.period_s)), arrived_s - self._newest_s)
+            self._shift(1 + self._lost(arrived_s), arrived_s - self._newest_s)
         self._seen += 1
         self._n += 1.0
         self._newest_s = arrived_s
@@ -55,6 +58,16 @@ class ClockLine:
         self._residual2 += (arrived_s - self._due_s) ** 2
         self._count += 1
         return self._due_s
+
+    def _lost(self, arrived_s: float) -> int:
+        """How many samples are known by now to have been lost."""
+        late = (arrived_s - self._due_s) / self.period_s - 1.0
+        self._late = [*self._late, late] if late >= 0.5 else []
+        if len(self._late) < CATCH_UP:
+            return 0
+        lost = round(min(self._late))
+        self._late = []
+        return lost
 
     def _shift(self, steps: int, seconds: float) -> None:
         """Let the sums fade and take them relative to a sample ``steps`` and ``seconds`` after the newest."""
