@@ -23,7 +23,7 @@ from trainer.config import ConfigError
 from trainer.drivers import sequence_file
 from trainer.drivers.closure import OUT_OF_RANGE, SILENT
 from trainer.drivers.minibird import Minibird
-from trainer.drivers.minibird_flock import Flock
+from trainer.drivers.minibird_flock import UNHURRIED, Flock
 from trainer.drivers.minibird_record import MIRROR, Sample
 from trainer.drivers.serial_port import DeviceError, read_some
 from trainer.poses import ToolPoses
@@ -116,7 +116,8 @@ def test_every_position_of_the_real_recording_arrives(tmp_path: Path, speed: flo
     profile.write_text(f'name = "three"\ndriver = "minibird"\nsummary = ""\n[minibird]\nport = "x"\n{birds}')
     found: dict[int, list[Sample]] = {1: [], 2: [], 3: []}
     with simulated(tmp_path / "out", "--motion", str(REAL), profile=str(profile), speed=speed) as path:
-        flock = Flock(replace(spec_of(loaded(path)), quaternion="direct"), SHORT)
+        silences = SHORT if speed > 1.0 else UNHURRIED
+        flock = Flock(replace(spec_of(loaded(path)), quaternion="direct"), silences)
         flock.connect()
         [(port, parser)] = flock.begin().values()
         ends = time.monotonic() + sequence.duration_s / speed + PATIENCE_S
