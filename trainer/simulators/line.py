@@ -16,7 +16,7 @@ CHUNKS = (1, 7, 16, 62)
 BUNCH_S = 0.016  # the latency timer of a common USB adapter
 #: A device that says more than its line can carry is cut off at so many writes, …
 MOST_WAITING = 20_000
-#: … and a host that does not read loses what goes beyond the terminal's own 20 kB by so many bytes.
+#: … and a host that does not read loses what goes beyond the terminal's own 20 kB by so many bytes (at real speed).
 MOST_LATE = 64_000
 
 
@@ -31,6 +31,7 @@ class Line:
         self._baud = baud
         self._byte_s = 10.0 / (baud * speed)
         self._bunch_s = BUNCH_S / speed
+        self._most_late = int(MOST_LATE * speed)
         self._faults = faults
         self._rng = rng
         self._waiting: deque[tuple[float, bytes]] = deque()  # when the last byte of each piece is out
@@ -100,7 +101,7 @@ class Line:
                 taken = os.write(self._master, self._late)
             except OSError:
                 taken = 0
-            self._late = self._late[taken:][:MOST_LATE]
+            self._late = self._late[taken:][: self._most_late]
 
     def next_s(self) -> float:
         """When the next bytes are due; infinity where none wait."""
