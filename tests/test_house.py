@@ -176,7 +176,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A wheel of a copy of this tree; building must not warn that something is left out."""
     copy = tmp_path_factory.mktemp("wheel") / "copy"
     copy.mkdir()
-    for folder in ("trainer", "anatomy", "curricula", "devices", "reports"):
+    for folder in ("trainer", "curricula", "devices", "reports"):
         shutil.copytree(ROOT / folder, copy / folder, ignore=shutil.ignore_patterns("__pycache__"))
     for file in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / file, copy)
@@ -189,13 +189,13 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_wheel_holds_all_code_and_data(wheel: Path) -> None:
     data = [
-        *(ROOT / "anatomy").rglob("*.toml"),
         *(ROOT / "curricula").rglob("*.toml"),
         *(ROOT / "devices").rglob("*.toml"),
         *(p for p in (ROOT / "reports" / "templates").rglob("*") if p.is_file()),
         ROOT / "reports" / "speed_error.json",
     ]
     expected = {m.relative_to(ROOT).as_posix() for m in MODULES}
+    expected |= {p.relative_to(ROOT).as_posix() for p in (ROOT / "trainer" / "anatomy" / "data").rglob("*.toml")}
     expected |= {f"trainer/_data/{p.relative_to(ROOT).as_posix()}" for p in data}
     with zipfile.ZipFile(wheel) as archive:
         found = {name for name in archive.namelist() if ".dist-info/" not in name}

@@ -20,7 +20,7 @@ from trainer.geometry import Array, Rigid
 SHARED = Path(__file__).parents[3] / "shared/data/knee"
 REAL = SHARED / "SAG_3D_DESS_RIGHT_bones_cart_men_fib-label.nrrd"
 ROOT = Path(__file__).parents[2]
-MSKT = ROOT / "anatomy/labels/mskt.toml"
+MSKT = ROOT / "trainer/anatomy/data/labels/mskt.toml"
 real_knee = pytest.mark.skipif(not REAL.exists(), reason="the segmented knee of shared/data is not here")
 
 #: mL, from the table in shared/data/README.md, which gives one decimal.
@@ -83,7 +83,9 @@ def test_the_built_in_knee_is_the_same_at_any_resolution(voxel_mm: float, built:
 
 def test_a_left_knee_is_the_mirrored_right_one(built: LabelVolume, tmp_path: Path) -> None:
     path = tmp_path / "left.toml"
-    path.write_text((ROOT / "anatomy/knees/knee.toml").read_text().replace('side = "right"', 'side = "left"'))
+    path.write_text(
+        (ROOT / "trainer/anatomy/data/knees/knee.toml").read_text().replace('side = "right"', 'side = "left"')
+    )
     left = knee.build(knee.load(str(path)), 1.0)
     bones = [s.number for s in structures().values() if s.kind != "ligament"]
     keep = np.isin(np.arange(256), bones)

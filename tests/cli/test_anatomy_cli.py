@@ -13,7 +13,7 @@ from trainer.anatomy import knee
 from trainer.anatomy.label_volume import LabelVolume, write_nrrd
 
 CommandLine = Callable[..., tuple[int, str, str]]
-TRAINER_LABELS = Path(__file__).parents[2] / "anatomy/labels/trainer.toml"
+TRAINER_LABELS = Path(__file__).parents[2] / "trainer/anatomy/data/labels/trainer.toml"
 
 
 @pytest.fixture(scope="module")

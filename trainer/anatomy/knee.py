@@ -1,4 +1,4 @@
-"""A knee from parameters, at any resolution, for those who have no scan: ``anatomy/knees/*.toml``.
+"""A knee from parameters, at any resolution, for those who have no scan: ``data/knees/*.toml``.
 
 Each bone is a solid of few parts (rounded cylinders, cones of elliptic section, spheres), given by a function that is
 negative inside and about the distance to the surface nearby; a union is the least of its parts, a hollow is cut out by
@@ -19,9 +19,8 @@ import numpy as np
 from trainer import config
 from trainer.anatomy.label_volume import LabelVolume
 from trainer.anatomy.ligaments import swept_cruciates
-from trainer.anatomy.structures import number_of
+from trainer.anatomy.structures import DATA, number_of
 from trainer.config import LENGTH_MM, POSITION_MM, Bounds, ConfigError
-from trainer.data_files import data_folder
 from trainer.geometry import Array, Rigid, quaternion_from_matrix
 
 Pair = tuple[float, float]
@@ -151,7 +150,7 @@ class KneeSpec:
 
 def load(name: str) -> KneeSpec:
     """The built-in knee of that name, or of a path that ends in .toml. Raises ConfigError."""
-    path = Path(name) if name.endswith(".toml") else data_folder("anatomy") / "knees" / f"{name}.toml"
+    path = Path(name) if name.endswith(".toml") else DATA / "knees" / f"{name}.toml"
     if not path.is_file():
         raise ConfigError(f"no built-in knee '{name}'; there is {', '.join(names())}")
     return config.build(KneeSpec, config.read_toml(path), str(path))
@@ -159,7 +158,7 @@ def load(name: str) -> KneeSpec:
 
 def names() -> list[str]:
     """The built-in knees."""
-    return sorted(path.stem for path in (data_folder("anatomy") / "knees").glob("*.toml"))
+    return sorted(path.stem for path in (DATA / "knees").glob("*.toml"))
 
 
 def build(spec: KneeSpec, voxel_mm: float = USUAL_MM) -> LabelVolume:

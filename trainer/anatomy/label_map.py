@@ -10,10 +10,9 @@ from typing import Any, Literal
 import numpy as np
 
 from trainer import config
-from trainer.anatomy.structures import number_of, structures
+from trainer.anatomy.structures import DATA, number_of, structures
 from trainer.anatomy.volume_file import LARGEST_LABEL
 from trainer.config import ConfigError
-from trainer.data_files import data_folder
 
 #: What a label is mapped to that a knee of ours does not have: muscle, skin, an implant.
 IGNORED = "ignored"
@@ -93,7 +92,7 @@ def shipped() -> list[LabelMap]:
 
 
 def _shipped_folder() -> Path:
-    return data_folder("anatomy") / "labels"
+    return DATA / "labels"
 
 
 def check_against(given: LabelMap, present: set[int], file: str) -> None:

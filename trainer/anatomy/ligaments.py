@@ -1,6 +1,6 @@
 """Cruciate ligaments for a knee whose scan shows none: bundles swept between their footprints on the bones.
 
-Footprints come from measured knees (``anatomy/ligaments.toml``) and are carried over by what both knees have: the
+Footprints come from measured knees (``data/ligaments.toml``) and are carried over by what both knees have: the
 line between the femur's epicondyles, the tibia's eminence and its posterior edge. Bones differ, so all of a ligament's
 footprints on a bone are then moved together, by as little as lets every bundle run through free space, and each is set
 down on the nearest surface of its bone. Where no such place is found within reach, the ligament is not made, and that
@@ -18,9 +18,8 @@ import numpy as np
 
 from trainer import config
 from trainer.anatomy.label_volume import LabelVolume
-from trainer.anatomy.structures import number_of
+from trainer.anatomy.structures import DATA, number_of
 from trainer.config import LENGTH_MM, POSITION_MM
-from trainer.data_files import data_folder
 from trainer.geometry import Array, unit
 
 CRUCIATES = ("anterior cruciate ligament", "posterior cruciate ligament")
@@ -49,7 +48,7 @@ class Bundle:
 
 @dataclass(frozen=True)
 class Ligaments:
-    """``anatomy/ligaments.toml``."""
+    """``data/ligaments.toml``."""
 
     source: str
     epicondyles_middle_mm: tuple[float, float, float] = field(metadata=POSITION_MM)
@@ -73,7 +72,7 @@ class _Knee:
 @cache
 def ligaments() -> Ligaments:
     """The shipped bundles. Raises ConfigError."""
-    path = data_folder("anatomy") / "ligaments.toml"
+    path = DATA / "ligaments.toml"
     return config.build(Ligaments, config.read_toml(path), str(path))
 
 

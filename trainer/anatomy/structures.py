@@ -1,14 +1,17 @@
-"""The structures of a knee, as ``anatomy/structures.toml`` lists them: their numbers in volumes, kinds and colours."""
+"""The structures of a knee, as ``data/structures.toml`` lists them: their numbers in volumes, kinds and colours."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cache
+from pathlib import Path
 from typing import Literal
 
 from trainer import config
 from trainer.config import Bounds, ConfigError
-from trainer.data_files import data_folder
+
+#: Structures, label maps, footprints and built-in knees.
+DATA = Path(__file__).parent / "data"
 
 
 @dataclass(frozen=True)
@@ -25,7 +28,7 @@ class Structure:
 @cache
 def structures() -> dict[str, Structure]:
     """All structures by name, in the order of their numbers. Raises ConfigError."""
-    path = data_folder("anatomy") / "structures.toml"
+    path = DATA / "structures.toml"
     table = config.read_toml(path)
     found = {name: config.build(Structure, entry, str(path), name) for name, entry in table.items()}
     numbers = [s.number for s in found.values()]
