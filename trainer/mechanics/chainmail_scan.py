@@ -1,0 +1,170 @@
+"""The last and longest lists of ChainMail (:mod:`trainer.mechanics.chainmail`) as a scan through memory.
+
+When the lists along z and y are done, each element of the disturbed cross-section begins a line along x, and no line
+needs another: an element's sponsor is its neighbour in the plane before. So instead of keeping lists whole planes are
+compared with the plane before, in order of memory, with no indices to look up and 8 or 16 elements at a time. Each
+element is considered once, against the same sponsor and by the same arithmetic, so it ends at the same place to the
+last bit; and since no line needs another, several threads may share them out and that is no different either.
+
+What remains is the memory's own pace: 12 bytes in and 12 out per element, and 3 for links and marks. A plane is gone
+through in one go, so that memory is read as one stream, and the plane before is still in the cache if it has no more
+than about 60 000 elements (12 bytes each); of larger ones a share at a time goes through all planes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from trainer.mechanics.volume import FREE
+
+#: Elements of a plane that go through all planes together: they and those before fit into a cache of 1 MB.
+SHARE = 65536
+#: Elements that are looked at together: if all are to be considered no one asks each.
+RUN = 1024
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _all_take(mark_before, links, need, moved):  # type: ignore[no-untyped-def]
+    """Whether all (2), some (1) or none (0) of a run have a sponsor that moved, are linked to it and free."""
+    every, some = np.uint8(1), np.uint8(0)
+    for k in range(len(links)):
+        take = np.uint8((mark_before[k] == moved) & ((links[k] & need) == need))
+        every &= take
+        some |= take
+    return every + some
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _follow_all(u0, u1, u2, s0, s1, s2, l0, l1, l2, h0, h1, h2, still):  # type: ignore[no-untyped-def]
+    """A run into the limits of the run before; ``still`` says with 1 who need not move."""
+    for k in range(len(u0)):
+        x, y, z = u0[k], u1[k], u2[k]
+        nx = min(max(x, s0[k] + l0), s0[k] + h0)
+        ny = min(max(y, s1[k] + l1), s1[k] + h1)
+        nz = min(max(z, s2[k] + l2), s2[k] + h2)
+        still[k] = np.int32((nx == x) & (ny == y) & (nz == z))
+        u0[k], u1[k], u2[k] = nx, ny, nz
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sum(still):  # type: ignore[no-untyped-def]
+    count = np.int32(0)
+    for k in range(len(still)):
+        count += still[k]
+    return count
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _follow_some(u0, u1, u2, s0, s1, s2, low, high, mark, mark_before, links, need, moved):  # type: ignore[no-untyped-def]
+    """The same for those that have a sponsor; marks them and returns how many moved."""
+    count = 0
+    for k in range(len(u0)):
+        if mark_before[k] != moved or (links[k] & need) != need:
+            continue
+        x, y, z = u0[k], u1[k], u2[k]
+        nx = min(max(x, s0[k] + low[0]), s0[k] + high[0])
+        ny = min(max(y, s1[k] + low[1]), s1[k] + high[1])
+        nz = min(max(z, s2[k] + low[2]), s2[k] + high[2])
+        if nx == x and ny == y and nz == z:
+            mark[k] = moved + 1
+        else:
+            u0[k], u1[k], u2[k] = nx, ny, nz
+            mark[k] = moved
+            count += 1
+    return count
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def scan(u0, u1, u2, links, mark, moved, shape, d, low, high, plane, first, last, still):  # type: ignore[no-untyped-def]
+    """Lines from ``plane`` in direction ``d`` (0 is +x, 1 is −x); returns how many moved and the last plane's i.
+
+    They are those of the elements ``first`` to ``last`` (not included) of a plane, j·nz + k. ``still`` is room for a
+    run, (RUN,) int32.
+    """
+    nx, ny, nz = shape
+    need = np.uint8(FREE | (2 >> d))  # a link back towards the sponsor
+    step = 1 - 2 * d
+    total = 0
+    reached = plane
+    for share in range(first, last, SHARE):
+        i = plane + step
+        while 0 <= i < nx:
+            in_plane = 0
+            for run in range(share, min(share + SHARE, last), RUN):
+                width = min(RUN, min(share + SHARE, last) - run)
+                a = i * ny * nz + run
+                b = a - step * ny * nz
+                here, before = slice(a, a + width), slice(b, b + width)
+                takes = _all_take(mark[before], links[here], need, moved)
+                if takes == 2:
+                    rests = still[:width]
+                    _follow_all(
+                        u0[here], u1[here], u2[here], u0[before], u1[before], u2[before],
+                        low[0], low[1], low[2], high[0], high[1], high[2], rests,
+                    )  # fmt: skip
+                    at_rest = _sum(rests)
+                    if at_rest == 0:
+                        mark[here] = moved
+                    else:
+                        for k in range(width):
+                            mark[a + k] = moved + still[k]
+                    in_plane += width - at_rest
+                elif takes == 1:
+                    in_plane += _follow_some(
+                        u0[here], u1[here], u2[here], u0[before], u1[before], u2[before], low, high,
+                        mark[here], mark[before], links[here], need, moved,
+                    )  # fmt: skip
+            if in_plane == 0:
+                break
+            total += in_plane
+            reached = max(reached, i) if step > 0 else min(reached, i)
+            i += step
+    return total, reached
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _some_open(mark, links, bit, mark_there, links_there, considered):  # type: ignore[no-untyped-def]
+    """Whether any of a run moved, while its neighbour in one direction is free and was not considered."""
+    some = np.uint8(0)
+    for k in range(len(mark)):
+        some |= np.uint8(
+            (mark[k] == considered - np.uint8(1))
+            & ((links[k] & bit) != 0)
+            & ((mark_there[k] | np.uint8(1)) != considered)
+            & ((links_there[k] & np.uint8(FREE)) != 0)
+        )
+    return some
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def scan_left_out(links, mark, moved, strides, i0, i1, first, last, queue):  # type: ignore[no-untyped-def]
+    """What :func:`trainer.mechanics.chainmail.left_out` finds, in order of memory, where there is no list of the moved.
+
+    Looks at the elements ``first`` to ``last`` (not included) of the planes ``i0`` to ``i1``.
+    """
+    n = len(links)
+    considered = np.uint8(moved | 1)
+    count = 0
+    for i in range(i0, i1 + 1):
+        for begin in range(i * strides[0] + first, i * strides[0] + last, RUN):
+            end = min(begin + RUN, i * strides[0] + last)
+            some = np.uint8(0)
+            for d in range(6):
+                a, b = max(begin, -strides[d]), min(end, n - strides[d])
+                if a < b:
+                    there = slice(a + strides[d], b + strides[d])
+                    some |= _some_open(mark[a:b], links[a:b], np.uint8(1 << d), mark[there], links[there], considered)
+            if some == 0:
+                continue
+            for s in range(begin, end):
+                if mark[s] != moved:
+                    continue
+                for d in range(6):
+                    if links[s] & (1 << d):
+                        e = s + strides[d]
+                        if mark[e] | 1 != considered and links[e] & FREE:
+                            queue[count] = s
+                            count += 1
+                            break
+    return count
