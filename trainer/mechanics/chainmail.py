@@ -27,12 +27,15 @@ from trainer.mechanics.volume import FREE
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def consider(u0, u1, u2, links, mark, moved, e, s, low, high):  # type: ignore[no-untyped-def]
-    """Move the element ``e`` to within the limits of its sponsor ``s`` and mark it; says whether it had to move."""
+def consider(u0, u1, u2, mark, moved, e, s, low, high, row):  # type: ignore[no-untyped-def]
+    """Move the element ``e`` to within the limits of its sponsor ``s`` and mark it; says whether it had to move.
+
+    The limits are a row of ``low`` and ``high`` (r, 3).
+    """
     x, y, z = u0[e], u1[e], u2[e]
-    nx = min(max(x, u0[s] + low[0]), u0[s] + high[0])
-    ny = min(max(y, u1[s] + low[1]), u1[s] + high[1])
-    nz = min(max(z, u2[s] + low[2]), u2[s] + high[2])
+    nx = min(max(x, u0[s] + low[row, 0]), u0[s] + high[row, 0])
+    ny = min(max(y, u1[s] + low[row, 1]), u1[s] + high[row, 1])
+    nz = min(max(z, u2[s] + low[row, 2]), u2[s] + high[row, 2])
     if nx == x and ny == y and nz == z:
         mark[e] = moved + 1
         return False
@@ -57,7 +60,7 @@ def work_off(u0, u1, u2, links, mark, moved, strides, d, low, high, begin, core,
         s = queue[head]
         if links[s] & bit and (core < 0 or s // size % period == core):
             e = s + step
-            if links[e] & FREE and consider(u0, u1, u2, links, mark, moved, e, s, low, high):
+            if links[e] & FREE and consider(u0, u1, u2, mark, moved, e, s, low, high, d):
                 queue[tail] = e
                 tail += 1
     head = first
@@ -66,7 +69,7 @@ def work_off(u0, u1, u2, links, mark, moved, strides, d, low, high, begin, core,
         head += 1
         if links[s] & bit:
             e = s + step
-            if links[e] & FREE and consider(u0, u1, u2, links, mark, moved, e, s, low, high):
+            if links[e] & FREE and consider(u0, u1, u2, mark, moved, e, s, low, high, d):
                 queue[tail] = e
                 tail += 1
     return tail
@@ -99,7 +102,7 @@ def spread(u0, u1, u2, links, mark, moved, strides, low, high, queue, tail):  # 
             if links[s] & (1 << d):
                 e = s + strides[d]
                 if mark[e] | 1 != moved | 1 and links[e] & FREE:
-                    if consider(u0, u1, u2, links, mark, moved, e, s, low[d], high[d]):
+                    if consider(u0, u1, u2, mark, moved, e, s, low, high, d):
                         queue[tail] = e
                         tail += 1
     return tail
@@ -131,7 +134,7 @@ def cross_section(u0, u1, u2, links, mark, moved, strides, low, high, held, to, 
         begin = tail
         for d in (2 * axis, 2 * axis + 1):
             core = box[2 * axis + 1 - d % 2] if box[2 * axis] < box[2 * axis + 1] else -1
-            tail = work_off(u0, u1, u2, links, mark, moved, strides, d, low[d], high[d], begin, core, queue, tail)
+            tail = work_off(u0, u1, u2, links, mark, moved, strides, d, low, high, begin, core, queue, tail)
     for head in range(len(held), tail):
         e = queue[head]
         j, k = e % size_x // size_y, e % size_y
@@ -146,7 +149,7 @@ def lengthwise(u0, u1, u2, links, mark, moved, strides, low, high, queue, tail, 
     begin = tail
     for d in range(2):
         core = box[1 - d] if box[0] < box[1] else -1
-        tail = work_off(u0, u1, u2, links, mark, moved, strides, d, low[d], high[d], begin, core, queue, tail)
+        tail = work_off(u0, u1, u2, links, mark, moved, strides, d, low, high, begin, core, queue, tail)
     for head in range(begin, tail):
         i = queue[head] // strides[0]
         box[0], box[1] = min(box[0], i), max(box[1], i)
@@ -159,11 +162,11 @@ def over_seams(u0, u1, u2, links, mark, moved, ends, low, high, back_low, back_h
     for c in range(len(ends)):
         a, b = ends[c, 0], ends[c, 1]
         if mark[a] == moved and mark[b] | 1 != moved | 1 and links[b] & FREE:
-            if consider(u0, u1, u2, links, mark, moved, b, a, low[c], high[c]):
+            if consider(u0, u1, u2, mark, moved, b, a, low, high, c):
                 queue[tail] = b
                 tail += 1
         elif mark[b] == moved and mark[a] | 1 != moved | 1 and links[a] & FREE:
-            if consider(u0, u1, u2, links, mark, moved, a, b, back_low[c], back_high[c]):
+            if consider(u0, u1, u2, mark, moved, a, b, back_low, back_high, c):
                 queue[tail] = a
                 tail += 1
     return tail

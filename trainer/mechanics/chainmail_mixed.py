@@ -13,7 +13,7 @@ constraints, the largest component deciding; what that leaves over is stated in 
 
 Violations never grow on their way, so the waiting elements are kept in a radix heap (Ahuja, Mehlhorn, Orlin and Tarjan
 1990): bucket b holds the violations whose bits differ from the last one's in bit b − 1 first. Equal violations are
-taken last come, first served.
+taken first come, first served.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ NOWHERE = 255
 class Waiting:
     """The elements that wait, in lists through arrays by element. What was never used takes no memory."""
 
-    first: Indices  # (BUCKETS,) first element of each bucket's list; -1 is none
-    after: Indices  # (n,) the next in the list; -1 is none
-    before: Indices  # (n,) the previous in the list; -1 - b is the head of bucket b
+    ends: Indices  # (BUCKETS, 2) first and last element of each bucket's list; a first below 0 is none
+    after: Indices  # (n,) the next in the list; -1 - b after the last of bucket b
+    before: Indices  # (n,) the previous in the list; -1 - b before the first of bucket b
     key: Indices  # (n,) LARGEST - bits of the violation
     via: Bytes  # (n,) the direction from the sponsor; NOWHERE if the element does not wait
     bits: tuple[NDArray[np.float32], Indices]  # (1,) one number, seen as a float and as its bits
@@ -50,7 +50,7 @@ class Waiting:
     def room(cls, n: int) -> Waiting:
         one = np.zeros(1, np.float32)
         return cls(
-            np.full(BUCKETS, -1, np.int32),
+            np.full((BUCKETS, 2), -1, np.int32),
             np.empty(n, np.int32),
             np.empty(n, np.int32),
             np.empty(n, np.int32),
@@ -80,97 +80,96 @@ def _bucket(key, last):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _put(e, b, first, after, before):  # type: ignore[no-untyped-def]
-    """Into bucket ``b``, in front."""
-    head = first[b]
-    after[e], before[e] = head, -1 - b
-    if head >= 0:
-        before[head] = e
-    first[b] = e
+def _put(e, b, ends, after, before):  # type: ignore[no-untyped-def]
+    """Into bucket ``b``, as its last."""
+    end = ends[b, 1]
+    after[e] = -1 - b
+    if ends[b, 0] < 0:
+        ends[b, 0] = e
+        before[e] = -1 - b
+    else:
+        after[end] = e
+        before[e] = end
+    ends[b, 1] = e
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _take(e, first, after, before):  # type: ignore[no-untyped-def]
+def _take(e, ends, after, before):  # type: ignore[no-untyped-def]
     """Out of its bucket."""
     nearer, further = before[e], after[e]
     if nearer < 0:
-        first[-1 - nearer] = further
+        ends[-1 - nearer, 0] = further
     else:
         after[nearer] = further
-    if further >= 0:
+    if further < 0:
+        ends[-1 - further, 1] = nearer
+    else:
         before[further] = nearer
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _violation(u, e, s, low, high):  # type: ignore[no-untyped-def]
+def _violation(u, e, s, low, high, row, c):  # type: ignore[no-untyped-def]
     """How far one component of ``e`` is beyond what its neighbour ``s`` allows; negative is within."""
     apart = u[e] - u[s]
-    return max(low - apart, apart - high)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _ask(u0, u1, u2, links, labels, material_of, mark, moved, strides, low, high, s, last, first, after, before, key, via, one, bits):  # type: ignore[no-untyped-def]
-    """Let the neighbours that the moved element ``s`` asks to move wait, or wait further ahead."""
-    a = material_of[labels[s]]
-    for d in range(6):
-        if links[s] & (1 << d) == 0:
-            continue
-        e = s + strides[d]
-        if mark[e] == moved or links[e] & FREE == 0:
-            continue
-        b = material_of[labels[e]]
-        l, h = low[a, b, d], high[a, b, d]
-        v = max(_violation(u0, e, s, l[0], h[0]), _violation(u1, e, s, l[1], h[1]))
-        v = max(v, _violation(u2, e, s, l[2], h[2]))
-        if v <= np.float32(0.0):
-            continue
-        one[0] = v
-        asked = max(np.int64(LARGEST) - bits[0], last)
-        if via[e] != NOWHERE:
-            if key[e] <= asked:
-                continue
-            _take(e, first, after, before)
-        key[e] = asked
-        via[e] = d
-        _put(e, _bucket(asked, last), first, after, before)
+    return max(low[row, c] - apart, apart - high[row, c])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def by_violation(
-    u0, u1, u2, links, labels, material_of, mark, moved, strides, low, high, queue, begin, tail,
-    first, after, before, key, via, one, bits,
+    u0, u1, u2, links, labels, material_of, materials, mark, moved, strides, low, high, queue, begin, tail,
+    ends, after, before, key, via, one, bits,
 ):  # type: ignore[no-untyped-def] # fmt: skip
-    """Move what ``queue[begin:tail]`` asks to move; returns the queue's end."""
+    """Move what ``queue[begin:tail]`` asks to move, and what that asks; returns the queue's end."""
     last = np.int64(0)
-    for head in range(begin, tail):
-        _ask(u0, u1, u2, links, labels, material_of, mark, moved, strides, low, high, queue[head], last,
-             first, after, before, key, via, one, bits)  # fmt: skip
+    head = begin
     while True:
+        while head < tail:  # the neighbours that a moved element asks to move wait, or wait further ahead
+            s = queue[head]
+            head += 1
+            a = np.int64(material_of[labels[s]])
+            for d in range(6):
+                if links[s] & (1 << d) == 0:
+                    continue
+                e = s + strides[d]
+                if mark[e] == moved or links[e] & FREE == 0:
+                    continue
+                row = (a * materials + material_of[labels[e]]) * 6 + d
+                v = max(_violation(u0, e, s, low, high, row, 0), _violation(u1, e, s, low, high, row, 1))
+                v = max(v, _violation(u2, e, s, low, high, row, 2))
+                if v <= np.float32(0.0):
+                    continue
+                one[0] = v
+                asked = max(np.int64(LARGEST) - bits[0], last)
+                if via[e] != NOWHERE:
+                    if key[e] <= asked:
+                        continue
+                    _take(e, ends, after, before)
+                key[e] = asked
+                via[e] = d
+                _put(e, _bucket(asked, last), ends, after, before)
         b = 0
-        while b < BUCKETS and first[b] < 0:
+        while b < BUCKETS and ends[b, 0] < 0:
             b += 1
         if b == BUCKETS:
             return tail
         if b > 0:
-            e = first[b]
+            e = ends[b, 0]
             last = np.int64(LARGEST)
             while e >= 0:
                 last = min(last, np.int64(key[e]))
                 e = after[e]
-            e = first[b]
-            first[b] = -1
+            e = ends[b, 0]
+            ends[b, 0] = -1
             while e >= 0:
                 further = after[e]
-                _put(e, _bucket(np.int64(key[e]), last), first, after, before)
+                _put(e, _bucket(np.int64(key[e]), last), ends, after, before)
                 e = further
-        e = first[0]
-        _take(e, first, after, before)
+        e = ends[0, 0]
+        _take(e, ends, after, before)
         d = via[e]
         via[e] = NOWHERE
         s = e - strides[d]
-        a, c = material_of[labels[s]], material_of[labels[e]]
-        if consider(u0, u1, u2, links, mark, moved, e, s, low[a, c, d], high[a, c, d]):
+        row = (np.int64(material_of[labels[s]]) * materials + material_of[labels[e]]) * 6 + d
+        if consider(u0, u1, u2, mark, moved, e, s, low, high, row):
             queue[tail] = e
             tail += 1
-            _ask(u0, u1, u2, links, labels, material_of, mark, moved, strides, low, high, e, last,
-                 first, after, before, key, via, one, bits)  # fmt: skip

@@ -134,6 +134,7 @@ class VolumeState:
     seams: Seams = field(default_factory=lambda: Seams.none())
     marks_used: int = 0
     awake: tuple[Indices, Indices] | None = None  # lowest and highest index (3,) of what was disturbed; None is nothing
+    disturbed: tuple[Indices, Indices] | None = None  # lowest and highest index of what was ever moved: elsewhere u is 0
     owed_s: float = 0.0  # time for which relaxation has not yet swept
     waiting: Waiting | None = None  # room for ChainMail in several materials
 
@@ -261,6 +262,12 @@ def _link(labels, table, material_of, links):  # type: ignore[no-untyped-def]
     return free
 
 
+def grid_strides(volume: Volume) -> np.ndarray:
+    """(9,) int64: the way in memory to the neighbour in each of the six directions, then nx, ny, nz."""
+    sx, sy, sz = volume.strides
+    return np.array([sx, -sx, sy, -sy, sz, -sz, *volume.shape], dtype=np.int64)
+
+
 def next_marks(state: VolumeState) -> tuple[np.uint8, np.uint8]:
     """The marks of the next move for elements that it moves and for those that it finds in no need of moving.
 
@@ -278,6 +285,9 @@ def wake(state: VolumeState, lowest: Indices, highest: Indices) -> None:
     if state.awake is not None:
         lowest, highest = np.minimum(state.awake[0], lowest), np.maximum(state.awake[1], highest)
     state.awake = (np.asarray(lowest, dtype=np.int32), np.asarray(highest, dtype=np.int32))
+    if state.disturbed is not None:
+        lowest, highest = np.minimum(state.disturbed[0], lowest), np.maximum(state.disturbed[1], highest)
+    state.disturbed = (np.asarray(lowest, dtype=np.int32), np.asarray(highest, dtype=np.int32))
 
 
 def places(volume: Volume, state: VolumeState, elements: Indices) -> Array:

@@ -7,11 +7,7 @@ element at the same place to the last bit. Several: largest violation first (:mo
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,16 +15,13 @@ from numpy.typing import ArrayLike
 from trainer.mechanics.chainmail import cross_section, left_out, lengthwise, over_seams, spread, widen
 from trainer.mechanics.chainmail_mixed import Waiting, by_violation
 from trainer.mechanics.chainmail_scan import RUN, scan, scan_left_out
+from trainer.mechanics.sharing import parts, share_out
 from trainer.mechanics.volume import (
-    PRESENT, Indices, Volume, VolumeError, VolumeState, next_marks, wake,
+    PRESENT, Indices, Volume, VolumeError, VolumeState, grid_strides, next_marks, wake,
 )  # fmt: skip
 
 #: A scan pays when so many moved in a cross-section, and at least one in so many of its elements (measured).
-SCAN_FROM, SCAN_SHARE = 64, 16
-#: From so many elements on, lines are shared out to threads: below that a thread costs more than it does.
-THREADS_FROM = 4_000_000
-#: More threads than memory channels can feed do nothing (measured: 48 GB/s by one core, 55 by three).
-MOST_THREADS = 3
+SCAN_FROM, SCAN_SHARE = 64, 2
 
 
 @dataclass(frozen=True)
@@ -72,12 +65,6 @@ def _check(volume: Volume, state: VolumeState, held: Indices, to: np.ndarray) ->
         raise VolumeError("a drag holds an element twice")
     if (volume.material_of[volume.labels.reshape(-1)[held]] < 0).any():
         raise VolumeError("a drag holds a rigid element")
-
-
-def grid_strides(volume: Volume) -> np.ndarray:
-    """(9,) int64: the way in memory to the neighbour in each of the six directions, then nx, ny, nz."""
-    sx, sy, sz = volume.strides
-    return np.array([sx, -sx, sy, -sy, sz, -sz, *volume.shape], dtype=np.int64)
 
 
 def _uniform(
@@ -128,39 +115,22 @@ def _scan(
 ) -> int:  # fmt: skip
     """The lines along x by scan, in as many threads as pay; returns how many moved and widens ``box``."""
     u0, u1, u2 = state.u
-    nx = volume.shape[0]
-    threads = min(_threads(), MOST_THREADS) if (last - first) * nx >= THREADS_FROM else 1
-    edges = [first + (last - first) * t // threads for t in range(threads + 1)]
     planes = (int(box[1]), int(box[0]))
 
-    def lines(t: int) -> list[tuple[int, int]]:
+    def lines(piece: tuple[int, int]) -> list[tuple[int, int]]:
         still = np.empty(RUN, dtype=np.int32)
         return [
             scan(
-                u0, u1, u2, state.links, state.mark, moved, volume.shape, d, low[d], high[d], planes[d],
-                edges[t], edges[t + 1], still,
+                u0, u1, u2, state.links, state.mark, moved, volume.shape, d, low[d], high[d], planes[d], *piece, still
             )
             for d in range(2)
         ]  # fmt: skip
 
-    run: Callable[..., object] = _pool().map if threads > 1 else map
     total = 0
-    for (ahead, i1), (behind, i0) in run(lines, range(threads)):  # type: ignore[attr-defined]
+    for (ahead, i1), (behind, i0) in share_out(lines, parts(first, last, (last - first) * volume.shape[0])):
         total += ahead + behind
         box[0], box[1] = min(box[0], i0), max(box[1], i1)
     return total
-
-
-@cache
-def _threads() -> int:
-    """One fewer than there are cores, which leaves one to whatever else runs; both of two."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return cores if cores <= 2 else cores - 1
-
-
-@cache
-def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(MOST_THREADS, thread_name_prefix="chainmail")
 
 
 def _mixed(
@@ -180,8 +150,8 @@ def _mixed(
     seams = state.seams
     while begin < tail:
         end = by_violation(
-            u0, u1, u2, state.links, volume.labels.reshape(-1), volume.material_of, mark, moved, strides,
-            volume.low, volume.high, queue, begin, tail, w.first, w.after, w.before, w.key, w.via, *w.bits,
+            u0, u1, u2, state.links, volume.labels.reshape(-1), volume.material_of, len(volume.materials),
+            mark, moved, strides, volume.low.reshape(-1, 3), volume.high.reshape(-1, 3), queue, begin, tail, w.ends, w.after, w.before, w.key, w.via, *w.bits,
         )  # fmt: skip
         tail = over_seams(
             u0, u1, u2, state.links, mark, moved, seams.ends, seams.low, seams.high, -seams.high, -seams.low, queue, end

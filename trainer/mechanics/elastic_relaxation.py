@@ -1,0 +1,272 @@
+"""Elastic relaxation: elements go to where their links want them, a part of the way at a time (Gibson et al. 1998, 3.2.2).
+
+ChainMail leaves a rough shape that merely respects limits; relaxation smooths it between moves and when nobody moves.
+Each sweep moves every free element by the same part of what would satisfy its links if its neighbours stayed where
+they were; all at once, from the places before the sweep (Jacobi), so that no order is preferred, and of a free body of
+one linear material the mean displacement stays where it is.
+
+Time. A displaced element whose neighbours rest comes back with its material's time constant τ: u(t) = u₀ exp(−t/τ).
+Sweeps are a fixed time apart, τ/8 of the fastest material, and time that is left over is kept for the next call, so
+that after the same time the same sweeps were made, whatever the tick: the same places, bit for bit. Each sweep moves
+by 1 − exp(−1/8), which is exact for that element; a slow mode of a large body, whose rate is λ/τ with λ ≪ 1, decays
+faster than λ/τ by 1/16, as the sweeps' own expansion shows: −ln(1 − (1 − e^(−s)) λ) = s λ (1 + (λ − 1) s/2 + …).
+Forces of elements that move slower than τ lag behind the pull: loading and unloading have different curves
+(hysteresis), the more so the faster.
+
+An element with all its links has the rate 1/τ; with fewer links it is held by fewer, and is slower in proportion.
+Where a J-curve is steeper than at rest, the part is taken of the steeper slope, so that no element overshoots.
+
+Only the region that is awake is swept: what was moved, and one more element around it with each sweep. It sleeps when
+nothing moved by more than STILL rest lengths in a sweep. Limits are ChainMail's business: relaxation, which averages,
+hardly ever leaves them, and does not ask.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from trainer.geometry import Array
+from trainer.mechanics.tissue_law import constants, link_answer, rest_stiffness
+from trainer.mechanics.sharing import parts, share_out
+from trainer.mechanics.volume import FREE, PRESENT, Indices, Singles, Volume, VolumeState, grid_strides, wake
+
+#: Sweeps in a time constant.
+SWEEPS = 8
+#: A region in which no element moves further than this in a sweep, in the shortest rest length, falls asleep.
+STILL = 1e-5
+#: Elements that are looked at together: if each has all its links no one asks which.
+RUN = 32
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _smooth_run(u, here, left, right, below, above, behind, ahead, links, wx, wy, wz, still):  # type: ignore[no-untyped-def]
+    """A run of elements: ``u`` is where they go, the rest where they and their neighbours were; returns how many went
+    further than ``still``. Where a link is missing the value that stands for the neighbour is not used."""
+    none = np.float32(0.0)
+    size, run = np.uint64(len(u)), np.uint64(RUN)  # unsigned, or each index is asked whether it counts from the end
+    for begin in range(np.uint64(0), size, run):
+        end = min(begin + run, size)
+        every = np.uint8(0xFF)
+        for k in range(begin, end):
+            every &= links[k]
+        if every == np.uint8(0xFF):
+            for k in range(begin, end):
+                x = here[k]
+                pull = wx * ((ahead[k] - x) + (behind[k] - x)) + wy * ((above[k] - x) + (below[k] - x))
+                u[k] = x + (pull + wz * ((right[k] - x) + (left[k] - x)))
+        else:
+            for k in range(begin, end):
+                x, l = here[k], links[k]
+                pull = wx * ((ahead[k] - x if l & 1 else none) + (behind[k] - x if l & 2 else none))
+                pull += wy * ((above[k] - x if l & 4 else none) + (below[k] - x if l & 8 else none))
+                pull += wz * ((right[k] - x if l & 16 else none) + (left[k] - x if l & 32 else none))
+                u[k] = x + (pull if l & FREE else none)
+    moving = 0
+    if still > none:
+        for k in range(len(u)):
+            moving += np.int32(abs(u[k] - here[k]) > still)
+    return moving
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def smooth(u, links, shape, box, wx, wy, wz, still, before, now, last):  # type: ignore[no-untyped-def]
+    """A sweep of one component ``u`` (n,) of one linear material; returns how many went further than ``still`` mm.
+
+    ``wx``, ``wy`` and ``wz`` are the parts of the difference to each neighbour by which an element moves. ``before``
+    holds the plane before the region, ``last`` the one after it, as they were before the sweep; they and ``now`` are
+    (ny nz + 2 (nz + 1),), a plane with a margin. So memory is read and written once. Rows are taken in one run where
+    the region is more than half as wide as the volume.
+    """
+    _, ny, nz = shape
+    plane, margin = ny * nz, nz + 1
+    i0, i1, j0, j1, k0, k1 = box
+    one = 2 * (k1 + 1 - k0) > nz
+    moving = 0
+    for i in range(i0, i1 + 1):
+        now[margin : margin + plane] = u[i * plane : (i + 1) * plane]
+        following = last[margin : margin + plane] if i == i1 else u[(i + 1) * plane : (i + 2) * plane]
+        for j in range(j0, j0 + 1 if one else j1 + 1):
+            a = j * nz + k0
+            b = j1 * nz + k1 + 1 if one else j * nz + k1 + 1
+            moving += _smooth_run(
+                u[i * plane + a : i * plane + b], now[a + margin : b + margin],
+                now[a + margin - 1 : b + margin - 1], now[a + margin + 1 : b + margin + 1],
+                now[a + margin - nz : b + margin - nz], now[a + margin + nz : b + margin + nz],
+                before[a + margin : b + margin], following[a:b],
+                links[i * plane + a : i * plane + b], wx, wy, wz, still,
+            )  # fmt: skip
+        before, now = now, before
+    return moving
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _pull(u, e, x, d, c, there, links, labels, material_of, law, h, area, strides):  # type: ignore[no-untyped-def]
+    """Force, mN, and stiffness, mN/mm, of the link in direction ``d`` on component ``c`` of an element at ``x``."""
+    axis = d // 2
+    sign = 1.0 - 2.0 * (d % 2)
+    a, b = material_of[labels[e]], material_of[labels[e + strides[d]]]
+    t, k = link_answer(law, a, b, axis == c, sign * (there - x) / h[axis])
+    return sign * area[axis] * t, k * area[axis] / h[axis]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def answer(u, links, labels, material_of, shape, strides, box, c, law, h, area, rest, part, still, before, now, last):  # type: ignore[no-untyped-def]
+    """A sweep of component ``c`` for any laws and materials; like :func:`smooth`, but asks each link.
+
+    ``rest`` (m, 3, 3) is the stiffness at rest and ``part`` (m,) how much of the way an element goes.
+    """
+    _, ny, nz = shape
+    plane, margin = ny * nz, nz + 1
+    i0, i1, j0, j1, k0, k1 = box
+    moving = 0
+    for i in range(i0, i1 + 1):
+        now[margin : margin + plane] = u[i * plane : (i + 1) * plane]
+        for j in range(j0, j1 + 1):
+            for k in range(k0, k1 + 1):
+                e = i * plane + j * nz + k
+                bits = links[e]
+                if bits & FREE == 0:
+                    continue
+                p = margin + j * nz + k
+                x = now[p]
+                force, stiffness = 0.0, 0.0
+                for d in range(6):
+                    if bits & (1 << d) == 0:
+                        continue
+                    if d == 0:
+                        there = last[p] if i == i1 else u[e + plane]
+                    elif d == 1:
+                        there = before[p]
+                    else:
+                        there = now[p + strides[d]]
+                    f, s = _pull(u, e, x, d, c, there, links, labels, material_of, law, h, area, strides)
+                    force += f
+                    stiffness += s
+                m = material_of[labels[e]]
+                whole = 0.0
+                for axis in range(3):
+                    if shape[axis] > 1:
+                        whole += 2.0 * rest[m, axis, c]
+                way = part[m] * force / max(whole, stiffness)
+                u[e] = x + way
+                moving += abs(way) > still
+        before, now = now, before
+    return moving
+
+
+def relax(volume: Volume, state: VolumeState, duration_s: float) -> int:
+    """Let the volume relax for ``duration_s``; returns the number of sweeps. Nothing awake, nothing done."""
+    if not (duration_s >= 0.0 and math.isfinite(duration_s)):
+        raise ValueError(f"relaxation was asked to last {duration_s} s; expected at least 0")
+    step_s = min(m.time_constant_s for m in volume.materials) / SWEEPS
+    state.owed_s += duration_s
+    # A billionth of a step is rounding of the sum of the ticks.
+    due = math.floor(state.owed_s / step_s + 1e-9)
+    state.owed_s -= due * step_s
+    for done in range(due):
+        if state.awake is None:
+            return done
+        sweep(volume, state, step_s, look=done == due - 1)
+    return due
+
+
+def sweep(volume: Volume, state: VolumeState, step_s: float, look: bool = True) -> None:
+    """One sweep of the region that is awake; ``look`` asks whether anything still moves."""
+    if state.awake is None:
+        return
+    size = np.array(volume.shape)
+    lowest, highest = np.maximum(state.awake[0] - 1, 0), np.minimum(state.awake[1] + 1, size - 1)
+    box = np.stack([lowest, highest], axis=1).ravel().astype(np.int64)
+    rest = rest_stiffness(volume)
+    part = np.array([-math.expm1(-step_s / m.time_constant_s) for m in volume.materials])
+    whole = 2.0 * np.einsum("mac,a->mc", rest, size > 1)
+    seams = _seam_ways(volume, state, rest, part, whole)
+    still = STILL * min(volume.spacing_mm) if look else 0.0
+    h = np.array(volume.spacing_mm)
+    law, strides = constants(volume), grid_strides(volume)[:6]
+    linear = not law[:, 2:5:2].any()
+    moving = 0
+    for c in range(3):
+        u = state.u[c]
+        weights = [np.float32(part[0] * rest[0, axis, c] / whole[0, c]) for axis in range(3)]
+
+        def slab(piece: tuple[int, int]) -> int:
+            own = np.array([piece[0], piece[1] - 1, *box[2:]])
+            before, last = edges[piece]
+            now = np.zeros_like(before)
+            if linear and len(volume.materials) == 1:
+                done = smooth(u, state.links, volume.shape, own, *weights, np.float32(still), before, now, last)
+            else:
+                done = answer(
+                    u, state.links, volume.labels.reshape(-1), volume.material_of, volume.shape, strides, own, c, law,
+                    h, volume.element_mm3 / h, rest, part, still, before, now, last,
+                )  # fmt: skip
+            return int(done)
+
+        pieces = parts(int(box[0]), int(box[1]) + 1, int(np.prod(box[1::2] - box[0::2] + 1)))
+        edges = {piece: (_plane(volume, u, piece[0] - 1), _plane(volume, u, piece[1])) for piece in pieces}
+        moving += sum(share_out(slab, pieces))
+    if len(seams):
+        for end in range(2):
+            np.add.at(state.u, (slice(None), state.seams.ends[:, end]), seams[:, end].T)
+        moving += int(np.count_nonzero(np.abs(seams) > still))
+    wake(state, lowest.astype(np.int32), highest.astype(np.int32))
+    if look and moving == 0:
+        state.awake = None
+
+
+def _plane(volume: Volume, u: Singles, i: int) -> Singles:
+    """A copy of plane ``i`` with a margin; zeros outside the volume, where no link leads."""
+    nx, ny, nz = volume.shape
+    out = np.zeros(ny * nz + 2 * (nz + 1), dtype=np.float32)
+    if 0 <= i < nx:
+        out[nz + 1 : nz + 1 + ny * nz] = u[i * ny * nz : (i + 1) * ny * nz]
+    return out
+
+
+def _seam_ways(volume: Volume, state: VolumeState, rest: Array, part: Array, whole: Array) -> Array:
+    """How far seams move their ends (s, 2, 3) mm in a sweep: each is a linear link of its ends' materials."""
+    seams = state.seams
+    labels = volume.labels.reshape(-1)
+    stretched = (state.u[:, seams.ends[:, 1]] - state.u[:, seams.ends[:, 0]]).T - seams.rest
+    ways = np.zeros((len(seams.ends), 2, 3))
+    for end, sign in ((0, 1.0), (1, -1.0)):
+        elements = seams.ends[:, end]
+        m = volume.material_of[labels[elements]]
+        free = ((state.links[elements] & FREE) != 0) & (m >= 0)
+        share = part[m, None] * rest[m, seams.side // 2] / whole[m]
+        ways[:, end] = np.where(free[:, None], sign * share * stretched, 0.0)
+    return ways
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _force(u, c, links, labels, material_of, elements, strides, law, h, area):  # type: ignore[no-untyped-def]
+    total = 0.0
+    for e in elements:
+        for d in range(6):
+            if links[e] & (1 << d):
+                f, _ = _pull(
+                    u, e, np.float64(u[e]), d, c, np.float64(u[e + strides[d]]), links, labels, material_of, law, h,
+                    area, strides,
+                )  # fmt: skip
+                total += f
+    return total
+
+
+def force_on(volume: Volume, state: VolumeState, elements: Indices) -> Array:
+    """What the links of ``elements`` (k,) pull at them with, together: (3,) mN. Between themselves that is nothing."""
+    h = np.array(volume.spacing_mm)
+    strides = grid_strides(volume)
+    there = elements[(state.links[elements] & PRESENT) != 0]
+    return np.array(
+        [
+            _force(
+                state.u[c], c, state.links, volume.labels.reshape(-1), volume.material_of, there, strides,
+                constants(volume), h, volume.element_mm3 / h,
+            )
+            for c in range(3)
+        ]
+    )  # fmt: skip
