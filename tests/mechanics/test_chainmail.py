@@ -54,7 +54,9 @@ def test_a_bar_stretches_link_by_link_to_its_limit(method: str) -> None:
 def test_limits_are_each_axis_own(axis: int) -> None:
     """With limits (1.1, 1.2, 1.4) along x, y, z a pull along an axis is taken up by that axis's links."""
     of = material()
-    of = type(of)(**{**of.__dict__, "stretch": (1.1, 1.2, 1.4), "compression": (0.9, 0.7, 0.5), "shear": (0.0, 0.1, 0.2)})
+    of = type(of)(
+        **{**of.__dict__, "stretch": (1.1, 1.2, 1.4), "compression": (0.9, 0.7, 0.5), "shear": (0.0, 0.1, 0.2)}
+    )
     shape = [1, 1, 1]
     shape[axis] = 10
     volume = block((shape[0], shape[1], shape[2]), of)
@@ -69,7 +71,9 @@ def test_limits_are_each_axis_own(axis: int) -> None:
 
 
 @given(seeds, st.integers(1, 9), st.integers(1, 9), st.integers(1, 24), st.integers(1, 3))
-def test_a_block_stays_within_its_limits_and_both_methods_agree(seed: int, nx: int, ny: int, nz: int, pulls: int) -> None:
+def test_a_block_stays_within_its_limits_and_both_methods_agree(
+    seed: int, nx: int, ny: int, nz: int, pulls: int
+) -> None:
     """The theorem of Gibson 1997, for any limits and a volume within them: so it is for each pull after the first."""
     rng = np.random.default_rng(seed)
     of = material(float(rng.uniform(1, 1.5)), float(rng.uniform(0.4, 1)), float(rng.uniform(0, 0.5)))
@@ -86,7 +90,7 @@ def test_a_block_stays_within_its_limits_and_both_methods_agree(seed: int, nx: i
 
 @given(seeds, st.integers(1, 4))
 def test_both_methods_agree_in_any_shape(seed: int, held_count: int) -> None:
-    """Holes, bone, cuts, tacked elements, several held: the same places to the last bit, and the same elements moved."""
+    """Holes, bone, cuts, tacked elements, several held: the same places to the last bit, the same elements moved."""
     rng = np.random.default_rng(seed)
     shape = tuple(int(n) for n in rng.integers(1, 12, size=3))
     labels = random_shape(seed, (shape[0], shape[1], shape[2]), float(rng.uniform(0, 0.5)), float(rng.uniform(0, 0.1)))
@@ -128,7 +132,9 @@ def test_a_pull_goes_around_a_hole(method: str) -> None:
     state = start(volume)
     done = drag(volume, state, np.array([0]), (1.0, 2.0, 3.0), method)
     assert done.count == np.count_nonzero(labels) == state.free_count
-    np.testing.assert_array_equal(state.u[:, labels.reshape(-1) == 1].T, np.tile(np.float32([1, 2, 3]), (done.count, 1)))
+    np.testing.assert_array_equal(
+        state.u[:, labels.reshape(-1) == 1].T, np.tile(np.float32([1, 2, 3]), (done.count, 1))
+    )
 
 
 def test_a_pull_of_a_hundred_lengths_keeps_the_limits() -> None:

@@ -33,7 +33,9 @@ def relaxed(volume: Volume, state: VolumeState, sweeps: int = 4000) -> None:
 
 @pytest.mark.parametrize("kind", [{}, {"steepness": 1e-4}])
 @pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (0.3, -0.5, 0.2)])
-def test_a_displaced_element_comes_back_with_the_time_constant(direction: tuple[float, ...], kind: dict[str, float]) -> None:
+def test_a_displaced_element_comes_back_with_the_time_constant(
+    direction: tuple[float, ...], kind: dict[str, float]
+) -> None:
     """u(t) = u₀ exp(−t/τ) while the neighbours rest. Both kernels; a J-curve at small strain is linear to b ε/2, and
     that times the 1.5 τ that pass bounds the error of the exponent."""
     volume = block((3, 3, 3), material(time_constant_s=0.2, **kind))
@@ -66,9 +68,9 @@ def test_the_tick_does_not_matter(seed: int, ticks: list[int]) -> None:
 
 @given(seeds)
 def test_a_free_body_keeps_its_mean_place_and_loses_energy(seed: int) -> None:
-    """The sum of all displacements is unchanged, since what a link gives to one end it takes from the other; the energy,
-    Σ w Δu²/2, never grows, as for any step below 2 over the largest eigenvalue. One linear material, any shape and cuts.
-    Rounding: each sweep moves each element with an error of a few units in the last place."""
+    """The sum of all displacements is unchanged, since what a link gives to one end it takes from the other; the
+    energy, Σ w Δu²/2, never grows, as for any step below 2 over the largest eigenvalue. One linear material, any shape
+    and cuts. Rounding: each sweep moves each element with an error of a few units in the last place."""
     rng = np.random.default_rng(seed)
     labels = random_shape(seed, (5, 6, 7), float(rng.uniform(0, 0.5)))
     volume = build(labels, SPACING, {1: material()})
@@ -98,11 +100,14 @@ def test_a_free_body_keeps_its_mean_place_and_loses_energy(seed: int) -> None:
 
 @given(seeds)
 def test_both_kernels_agree_on_one_linear_material(seed: int) -> None:
-    """The one that asks each link, on the same material twice. Single against double precision: 10 roundings a sweep."""
+    """The one that asks each link, on the same material twice. Single against double precision, 10 roundings each."""
     rng = np.random.default_rng(seed)
     labels = random_shape(seed, (5, 4, 40), 0.2, 0.1, soft=2)
     of = material()
-    two, one = build(labels, SPACING, {1: of, 2: of}), build(np.where(labels == 2, 1, labels).astype(np.uint8), SPACING, {1: of})
+    two, one = (
+        build(labels, SPACING, {1: of, 2: of}),
+        build(np.where(labels == 2, 1, labels).astype(np.uint8), SPACING, {1: of}),
+    )
     u = rng.normal(size=(3, labels.size)).astype(np.float32) * (np.isin(labels, (1, 2)).reshape(-1))
     results = []
     for volume in (two, one):
@@ -161,7 +166,11 @@ def finite_elements(young: tuple[float, float], n: int, width: int, poisson: flo
     # harmonic mean.
     between = 2.0 * young[0] * young[1] / sum(young)
     edge = n // 2 - 1
-    for e, here in ((young[0], middle < edge), (between, (middle > edge) & (middle < edge + 1)), (young[1], middle > edge + 1)):
+    for e, here in (
+        (young[0], middle < edge),
+        (between, (middle > edge) & (middle < edge + 1)),
+        (young[1], middle > edge + 1),
+    ):
         part = Basis(mesh, vector, elements=np.flatnonzero(here))
         matrix = matrix + asm(linear_elasticity(*lame_parameters(e, poisson)), part)
     x = basis.zeros()
@@ -174,9 +183,9 @@ def finite_elements(young: tuple[float, float], n: int, width: int, poisson: flo
 
 @pytest.mark.parametrize("young", [(100.0, 100.0), (100.0, 400.0)])
 def test_a_pulled_bar_is_that_of_finite_elements(young: tuple[float, float]) -> None:
-    """Without Poisson's effect a pulled bar's displacements are those of springs in a row, by hexahedra as by links. What
-    is left is the slowest mode after 4000 sweeps, exp(−4000/8 λ) with λ ≥ (π/12)²/10 below 1e-1: nothing; and rounding:
-    a sweep stops to move anything when its step is below half a unit in the last place, (EPS/2) / (λ/8)."""
+    """Without Poisson's effect a pulled bar's displacements are those of springs in a row, by hexahedra as by links.
+    What is left is the slowest mode after 4000 sweeps, exp(−4000/8 λ) with λ ≥ (π/12)²/10 below 1e-1: nothing; and
+    rounding: a sweep stops to move anything when its step is below half a unit in the last place, (EPS/2) / (λ/8)."""
     volume, state = bar(young)
     expected, nodes = finite_elements(young, 12, 3)
     at = np.round(nodes).astype(int)
@@ -249,7 +258,7 @@ def test_loading_and_unloading_differ_the_more_the_faster() -> None:
 
 
 def test_a_plastic_bar_keeps_what_is_within_its_yield_strain() -> None:
-    """Stretched to less than the yield strain and let go it stays; stretched further it comes back to it, and no more."""
+    """Stretched to less than the yield strain and let go it stays; stretched further it comes back to that."""
     y = 0.1
     volume = block((2, 1, 1), material(stretch=2.0, compression=0.1, yield_strain=y))
     for strain, kept in ((0.05, 0.05), (-0.08, -0.08), (0.5, y), (-0.5, -y)):
@@ -301,7 +310,11 @@ def test_a_ligament_fitted_to_one_table_answers_like_the_other() -> None:
     is the largest relative one from 1 % strain on (below, the slope at rest is all there is)."""
     strain, measured = table("ascending")
     young, steep = fitted(strain, measured)
-    volume = block((6, 1, 1), material(stretch=1.5, young_kPa=young, steepness=steep, straight_from=float(strain[-1])), (1.0, 1.0, 1.0))
+    volume = block(
+        (6, 1, 1),
+        material(stretch=1.5, young_kPa=young, steepness=steep, straight_from=float(strain[-1])),
+        (1.0, 1.0, 1.0),
+    )
     state = start(volume)
     tack(state, np.array([0, 5]))
     other_strain, other = table("descending")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import strategies as st
 
-from trainer.mechanics.volume import FREE, LINKS, PRESENT, Material, Volume, VolumeState, build, start
+from trainer.mechanics.volume import FREE, LINKS, PRESENT, Material, Volume, VolumeState, build
 
 SPACING = (0.5, 0.6, 0.8)
 
@@ -18,7 +18,9 @@ def material(
     return Material(name, (stretch,) * 3, (compression,) * 3, (shear,) * 3, **constants)
 
 
-def block(shape: tuple[int, int, int], of: Material | None = None, spacing: tuple[float, float, float] = SPACING) -> Volume:
+def block(
+    shape: tuple[int, int, int], of: Material | None = None, spacing: tuple[float, float, float] = SPACING
+) -> Volume:
     return build(np.ones(shape, np.uint8), spacing, {1: of or material()})
 
 

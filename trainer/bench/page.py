@@ -30,6 +30,7 @@ SUBJECTS = {
     "integrators": Subject("A swinging vessel", "nodes", 1e-2),
     "thread": Subject("A thread", "links", 5e-3),
     "contact": Subject("Contact search", "triangles or segments", 0.0),
+    "volume": Subject("Volumes of elements", "elements", 0.0),
 }
 
 Rows = Mapping[str, Sequence[Row]]

@@ -101,10 +101,10 @@ def spread(u0, u1, u2, links, mark, moved, strides, low, high, queue, tail):  # 
         for d in range(6):
             if links[s] & (1 << d):
                 e = s + strides[d]
-                if mark[e] | 1 != moved | 1 and links[e] & FREE:
-                    if consider(u0, u1, u2, mark, moved, e, s, low, high, d):
-                        queue[tail] = e
-                        tail += 1
+                open_ = mark[e] | 1 != moved | 1 and links[e] & FREE
+                if open_ and consider(u0, u1, u2, mark, moved, e, s, low, high, d):
+                    queue[tail] = e
+                    tail += 1
     return tail
 
 
@@ -161,14 +161,14 @@ def over_seams(u0, u1, u2, links, mark, moved, ends, low, high, back_low, back_h
     """Across the seams between a moved element and one that was not considered; returns the queue's end."""
     for c in range(len(ends)):
         a, b = ends[c, 0], ends[c, 1]
-        if mark[a] == moved and mark[b] | 1 != moved | 1 and links[b] & FREE:
-            if consider(u0, u1, u2, mark, moved, b, a, low, high, c):
-                queue[tail] = b
-                tail += 1
-        elif mark[b] == moved and mark[a] | 1 != moved | 1 and links[a] & FREE:
-            if consider(u0, u1, u2, mark, moved, a, b, back_low, back_high, c):
-                queue[tail] = a
-                tail += 1
+        ahead = mark[a] == moved and mark[b] | 1 != moved | 1 and links[b] & FREE
+        back = mark[b] == moved and mark[a] | 1 != moved | 1 and links[a] & FREE
+        if ahead and consider(u0, u1, u2, mark, moved, b, a, low, high, c):
+            queue[tail] = b
+            tail += 1
+        elif back and consider(u0, u1, u2, mark, moved, a, b, back_low, back_high, c):
+            queue[tail] = a
+            tail += 1
     return tail
 
 

@@ -115,10 +115,10 @@ def _violation(u, e, s, low, high, row, c):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def by_violation(
+def by_violation(  # type: ignore[no-untyped-def]
     u0, u1, u2, links, labels, material_of, materials, mark, moved, strides, low, high, queue, begin, tail,
     ends, after, before, key, via, one, bits,
-):  # type: ignore[no-untyped-def] # fmt: skip
+):  # fmt: skip
     """Move what ``queue[begin:tail]`` asks to move, and what that asks; returns the queue's end."""
     last = np.int64(0)
     head = begin

@@ -56,7 +56,11 @@ def region(points: Array, normals: Array, pairs: np.ndarray, cell_mm: float) -> 
     normal = way / length
     overlaps = cell_mm - (points[other] - points[one]) @ normal
     overlap = float(np.mean(np.maximum(overlaps, 0.0)))
-    return Region(np.mean(0.5 * (points[one] + points[other]), axis=0), normal, overlap, len(pairs)) if overlap > 0.0 else None
+    return (
+        Region(np.mean(0.5 * (points[one] + points[other]), axis=0), normal, overlap, len(pairs))
+        if overlap > 0.0
+        else None
+    )
 
 
 def push(contact: Region, pose: Rigid, centre: Array, gyration_mm: float) -> Rigid:
@@ -102,7 +106,9 @@ def separate(
     return pose, most
 
 
-def push_out(points: Array, normals: Array, pairs: np.ndarray, soft: np.ndarray, cell_mm: float) -> tuple[Indices, Array]:
+def push_out(
+    points: Array, normals: Array, pairs: np.ndarray, soft: np.ndarray, cell_mm: float
+) -> tuple[Indices, Array]:
     """Entries (k,) of tissue that touch something, and by how much each is to move, (k, 3) mm.
 
     ``soft`` (s,) says which entries are tissue: against rigid ones they go all the way, against each other half.

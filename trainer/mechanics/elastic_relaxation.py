@@ -1,4 +1,4 @@
-"""Elastic relaxation: elements go to where their links want them, a part of the way at a time (Gibson et al. 1998, 3.2.2).
+"""Elastic relaxation: elements go part of the way to where their links want them (Gibson et al. 1998, 3.2.2).
 
 ChainMail leaves a rough shape that merely respects limits; relaxation smooths it between moves and when nobody moves.
 Each sweep moves every free element by the same part of what would satisfy its links if its neighbours stayed where
@@ -29,8 +29,8 @@ import numpy as np
 from numba import njit
 
 from trainer.geometry import Array
-from trainer.mechanics.tissue_law import constants, link_answer, rest_stiffness
 from trainer.mechanics.sharing import parts, share_out
+from trainer.mechanics.tissue_law import constants, link_answer, rest_stiffness
 from trainer.mechanics.volume import FREE, PRESENT, Indices, Singles, Volume, VolumeState, grid_strides, wake
 
 #: Sweeps in a time constant.
@@ -59,15 +59,15 @@ def _smooth_run(u, here, left, right, below, above, behind, ahead, links, wx, wy
                 u[k] = x + (pull + wz * ((right[k] - x) + (left[k] - x)))
         else:
             for k in range(begin, end):
-                x, l = here[k], links[k]
-                pull = wx * ((ahead[k] - x if l & 1 else none) + (behind[k] - x if l & 2 else none))
-                pull += wy * ((above[k] - x if l & 4 else none) + (below[k] - x if l & 8 else none))
-                pull += wz * ((right[k] - x if l & 16 else none) + (left[k] - x if l & 32 else none))
-                u[k] = x + (pull if l & FREE else none)
+                x, bits = here[k], links[k]
+                pull = wx * ((ahead[k] - x if bits & 1 else none) + (behind[k] - x if bits & 2 else none))
+                pull += wy * ((above[k] - x if bits & 4 else none) + (below[k] - x if bits & 8 else none))
+                pull += wz * ((right[k] - x if bits & 16 else none) + (left[k] - x if bits & 32 else none))
+                u[k] = x + (pull if bits & FREE else none)
     moving = 0
     if still > none:
         for k in range(len(u)):
-            moving += np.int32(abs(u[k] - here[k]) > still)
+            moving += 1 if abs(u[k] - here[k]) > still else 0
     return moving
 
 
@@ -188,30 +188,35 @@ def sweep(volume: Volume, state: VolumeState, step_s: float, look: bool = True) 
     h = np.array(volume.spacing_mm)
     law, strides = constants(volume), grid_strides(volume)[:6]
     linear = not law[:, 2:5:2].any()
-    moving = 0
-    for c in range(3):
-        u = state.u[c]
-        weights = [np.float32(part[0] * rest[0, axis, c] / whole[0, c]) for axis in range(3)]
+    pieces = parts(int(box[0]), int(box[1]) + 1, int(np.prod(box[1::2] - box[0::2] + 1)))
+    edges = [
+        [(_plane(volume, state.u[c], begin - 1), _plane(volume, state.u[c], end)) for begin, end in pieces]
+        for c in range(3)
+    ]
 
-        def slab(piece: tuple[int, int]) -> int:
-            own = np.array([piece[0], piece[1] - 1, *box[2:]])
-            before, last = edges[piece]
+    def slab(piece: tuple[int, int]) -> int:
+        own = np.array([piece[0], piece[1] - 1, *box[2:]])
+        moving = 0
+        for c in range(3):
+            before, last = edges[c][pieces.index(piece)]
             now = np.zeros_like(before)
             if linear and len(volume.materials) == 1:
-                done = smooth(u, state.links, volume.shape, own, *weights, np.float32(still), before, now, last)
+                wx, wy, wz = (np.float32(part[0] * rest[0, axis, c] / whole[0, c]) for axis in range(3))
+                moving += smooth(
+                    state.u[c], state.links, volume.shape, own, wx, wy, wz, np.float32(still), before, now, last
+                )
             else:
-                done = answer(
-                    u, state.links, volume.labels.reshape(-1), volume.material_of, volume.shape, strides, own, c, law,
-                    h, volume.element_mm3 / h, rest, part, still, before, now, last,
+                moving += answer(
+                    state.u[c], state.links, volume.labels.reshape(-1), volume.material_of, volume.shape, strides, own,
+                    c, law, h, volume.element_mm3 / h, rest, part, still, before, now, last,
                 )  # fmt: skip
-            return int(done)
+        return moving
 
-        pieces = parts(int(box[0]), int(box[1]) + 1, int(np.prod(box[1::2] - box[0::2] + 1)))
-        edges = {piece: (_plane(volume, u, piece[0] - 1), _plane(volume, u, piece[1])) for piece in pieces}
-        moving += sum(share_out(slab, pieces))
+    moving = sum(share_out(slab, pieces))
     if len(seams):
         for end in range(2):
-            np.add.at(state.u, (slice(None), state.seams.ends[:, end]), seams[:, end].T)
+            for c in range(3):
+                np.add.at(state.u[c], state.seams.ends[:, end], seams[:, end, c])
         moving += int(np.count_nonzero(np.abs(seams) > still))
     wake(state, lowest.astype(np.int32), highest.astype(np.int32))
     if look and moving == 0:

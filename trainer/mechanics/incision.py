@@ -19,11 +19,20 @@ from numpy.typing import ArrayLike
 
 from trainer.geometry import Array
 from trainer.mechanics.volume import (
-    FREE, LINKS, PRESENT, Indices, Seams, Volume, VolumeState, grid_strides, places, wake,
-)  # fmt: skip
+    FREE,
+    LINKS,
+    PRESENT,
+    Indices,
+    Seams,
+    Volume,
+    VolumeState,
+    grid_strides,
+    places,
+    wake,
+)
 from trainer.mechanics.volume_drag import drag
 
-#: Links are torn when they are beyond their limits by more than this part of their rest length: above rounding (assumed).
+#: By how much of its rest length a link must be beyond its limits to tear: above rounding (assumed).
 TEAR_SLACK = 1e-3
 #: How often what is beyond its limits between free elements is moved before it tears.
 ATTEMPTS = 3
@@ -95,7 +104,7 @@ def crosses(p, q, a, b, c):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _cut(u, links, h, strides, lowest, highest, quad, box, p, q, broken, count):  # type: ignore[no-untyped-def]
-    """Links through the two triangles of ``quad`` (4, 3) of elements in an index range; written as far as there is room.
+    """Links of an index range through the two triangles of ``quad`` (4, 3), as far as there is room; returns how many.
 
     ``box`` (2, 3) is around the quad; ``p`` and ``q`` (3,) are room.
     """
@@ -151,7 +160,10 @@ def cut(volume: Volume, state: VolumeState, before: ArrayLike, after: ArrayLike)
     broken = broken[:count]
     ends = [places(volume, state, state.seams.ends[:, end]) for end in range(2)]
     through = np.array(
-        [crosses(p, q, quad[0], quad[1], quad[2]) or crosses(p, q, quad[0], quad[2], quad[3]) for p, q in zip(*ends, strict=True)],
+        [
+            crosses(p, q, quad[0], quad[1], quad[2]) or crosses(p, q, quad[0], quad[2], quad[3])
+            for p, q in zip(*ends, strict=True)
+        ],
         dtype=np.bool_,
     )
     return _break(volume, state, broken, through)
@@ -264,12 +276,12 @@ def erase(volume: Volume, state: VolumeState, elements: Indices) -> Change:
         linked = gone[(state.links[gone] & (1 << d)) != 0]
         state.links[linked + strides[d]] &= np.uint8(0xFF ^ (1 << (d ^ 1)))
         inside = np.isin(linked + strides[d], gone)
-        links += np.count_nonzero(~inside) + (np.count_nonzero(inside) if d % 2 == 0 else 0)
+        links += int(np.count_nonzero(~inside)) + (int(np.count_nonzero(inside)) if d % 2 == 0 else 0)
         state.links[gone] &= np.uint8(0xFF ^ (1 << d))
     state.free_count -= int(np.count_nonzero(state.links[gone] & FREE))
     state.links[gone] &= np.uint8(0xFF ^ (FREE | PRESENT | LINKS))
     state.u[:, gone] = 0.0
-    hold = ~np.isin(state.seams.ends, gone).any(axis=1)
+    hold = np.logical_not(np.isin(state.seams.ends, gone).any(axis=1, keepdims=True))[:, 0]
     links += int(np.count_nonzero(~hold))
     state.seams = kept(state.seams, hold)
     if len(gone):

@@ -53,6 +53,12 @@ def islands(state: VolumeState, volume: Volume) -> list[Indices]:
     begin = np.searchsorted(pairs[:, 0], np.arange(n + 1)) if len(pairs) else np.zeros(1, np.int64)
     queue, starts = np.empty(n, np.int32), np.empty(n + 1, np.int64)
     count = _flood(
-        state.links, grid_strides(volume), begin, np.ascontiguousarray(pairs[:, 1]), np.zeros(n, np.bool_), queue, starts
+        state.links,
+        grid_strides(volume),
+        begin,
+        np.ascontiguousarray(pairs[:, 1]),
+        np.zeros(n, np.bool_),
+        queue,
+        starts,
     )
     return [np.sort(queue[starts[c] : starts[c + 1]]) for c in range(count)]

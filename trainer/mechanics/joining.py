@@ -15,8 +15,18 @@ from numpy.typing import ArrayLike
 from trainer.geometry import Array
 from trainer.mechanics.incision import Change, change, index_range
 from trainer.mechanics.volume import (
-    FREE, LINKS, PRESENT, STEPS, Indices, Seams, Volume, VolumeState, grid_strides, places, wake,
-)  # fmt: skip
+    FREE,
+    LINKS,
+    PRESENT,
+    STEPS,
+    Indices,
+    Seams,
+    Volume,
+    VolumeState,
+    grid_strides,
+    places,
+    wake,
+)
 from trainer.mechanics.volume_drag import drag
 
 

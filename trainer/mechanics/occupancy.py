@@ -1,7 +1,7 @@
-"""The occupancy map: which elements of which bodies are in the same cell of a grid (Gibson 1995; Gibson et al. 1998, 3.3).
+"""The occupancy map: elements of which bodies are in the same cell of a grid (Gibson 1995; Gibson et al. 1998, 3.3).
 
-The space in which bodies meet is a regular grid of cells. Each element is entered in the cell that it is in; if somebody
-else is there already, they touch. Rigid and deformable bodies, and a body with itself, are treated alike: of the same
+Space is a regular grid of cells. Each element is entered in the cell that it is in; if somebody else is there already,
+they touch. Rigid and deformable bodies, and a body with itself, are treated alike: of the same
 body only elements further apart in its own grid than APART are taken to touch, since neighbours may share a cell when
 tissue is compressed.
 
@@ -103,7 +103,9 @@ class OccupancyMap:
             raise ValueError(f"an occupancy map from {low} to {high} mm with cells of {cell_mm} mm has no size")
         cells = [math.ceil(side / cell_mm) for side in sides]
         if math.prod(cells) > MOST_CELLS:
-            raise ValueError(f"an occupancy map of {cells[0]} x {cells[1]} x {cells[2]} cells is too large; take larger cells")
+            raise ValueError(
+                f"an occupancy map of {cells[0]} x {cells[1]} x {cells[2]} cells is too large; take larger cells"
+            )
         self.cell_mm = cell_mm
         self._low, self._cells = np.array(low, dtype=np.float64), np.array(cells, dtype=np.int64)
         self.begin = np.concatenate([[0], np.cumsum([len(b) for b in bodies])]).astype(np.int64)
@@ -123,7 +125,17 @@ class OccupancyMap:
         if points.shape != (end - first, 3):
             raise ValueError(f"body {body} has {end - first} elements in the map; found {points.shape} points")
         return int(
-            _enter(points, first, self._low, 1.0 / self.cell_mm, self._cells, self._head, self._cell, self._after, self._before)
+            _enter(
+                points,
+                first,
+                self._low,
+                1.0 / self.cell_mm,
+                self._cells,
+                self._head,
+                self._cell,
+                self._after,
+                self._before,
+            )
         )
 
     def touching(self) -> np.ndarray:

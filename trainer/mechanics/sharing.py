@@ -10,6 +10,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from itertools import pairwise
 from typing import TypeVar
 
 T = TypeVar("T")
@@ -36,7 +37,7 @@ def parts(begin: int, end: int, elements: int) -> list[tuple[int, int]]:
     """``begin`` to ``end`` in as many pieces as threads pay for so many elements."""
     count = max(1, min(_threads(), end - begin)) if elements >= FROM_ELEMENTS else 1
     edges = [begin + (end - begin) * t // count for t in range(count + 1)]
-    return list(zip(edges, edges[1:], strict=False))
+    return list(pairwise(edges))
 
 
 def share_out(work: Callable[[tuple[int, int]], T], pieces: list[tuple[int, int]]) -> list[T]:

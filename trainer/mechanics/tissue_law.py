@@ -23,7 +23,7 @@ YOUNG, SHEAR, STEEPNESS, STRAIGHT_FROM, YIELD = range(5)
 
 
 def constants(volume: Volume) -> Array:
-    """(m, 5): Young's modulus and shear modulus kPa, steepness, strain of the tangent, yield strain of each material."""
+    """(m, 5) of each material: Young's and shear modulus kPa, steepness, strain of the tangent, yield strain."""
     return np.array(
         [[m.young_kPa, m.shear_kPa, m.steepness, m.straight_from, m.yield_strain] for m in volume.materials]
     )

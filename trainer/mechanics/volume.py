@@ -119,7 +119,8 @@ class Volume:
 
     def rest(self, elements: Indices) -> Array:
         """Where ``elements`` (k,) rest: (k, 3) mm."""
-        return np.stack(np.unravel_index(elements, self.shape), axis=1) * np.array(self.spacing_mm)
+        index = np.stack(np.unravel_index(elements, self.shape), axis=1)
+        return np.asarray(index * np.array(self.spacing_mm))
 
 
 @dataclass
@@ -134,7 +135,9 @@ class VolumeState:
     seams: Seams = field(default_factory=lambda: Seams.none())
     marks_used: int = 0
     awake: tuple[Indices, Indices] | None = None  # lowest and highest index (3,) of what was disturbed; None is nothing
-    disturbed: tuple[Indices, Indices] | None = None  # lowest and highest index of what was ever moved: elsewhere u is 0
+    disturbed: tuple[Indices, Indices] | None = (
+        None  # lowest and highest index of what was ever moved: elsewhere u is 0
+    )
     owed_s: float = 0.0  # time for which relaxation has not yet swept
     waiting: Waiting | None = None  # room for ChainMail in several materials
 

@@ -17,8 +17,15 @@ from trainer.mechanics.chainmail_mixed import Waiting, by_violation
 from trainer.mechanics.chainmail_scan import RUN, scan, scan_left_out
 from trainer.mechanics.sharing import parts, share_out
 from trainer.mechanics.volume import (
-    PRESENT, Indices, Volume, VolumeError, VolumeState, grid_strides, next_marks, wake,
-)  # fmt: skip
+    PRESENT,
+    Indices,
+    Volume,
+    VolumeError,
+    VolumeState,
+    grid_strides,
+    next_marks,
+    wake,
+)
 
 #: A scan pays when so many moved in a cross-section, and at least one in so many of its elements (measured).
 SCAN_FROM, SCAN_SHARE = 64, 2
@@ -68,7 +75,13 @@ def _check(volume: Volume, state: VolumeState, held: Indices, to: np.ndarray) ->
 
 
 def _uniform(
-    volume: Volume, state: VolumeState, moved: np.uint8, held: Indices, to: np.ndarray, box: np.ndarray, method: str | None
+    volume: Volume,
+    state: VolumeState,
+    moved: np.uint8,
+    held: Indices,
+    to: np.ndarray,
+    box: np.ndarray,
+    method: str | None,
 ) -> tuple[int, str]:
     """ChainMail in one material; returns how many moved and by which method."""
     u0, u1, u2 = state.u
@@ -134,7 +147,13 @@ def _scan(
 
 
 def _mixed(
-    volume: Volume, state: VolumeState, moved: np.uint8, held: Indices, to: np.ndarray, box: np.ndarray, method: str | None
+    volume: Volume,
+    state: VolumeState,
+    moved: np.uint8,
+    held: Indices,
+    to: np.ndarray,
+    box: np.ndarray,
+    method: str | None,
 ) -> tuple[int, str]:
     """ChainMail in several materials; returns how many moved and by which method."""
     u0, u1, u2 = state.u
@@ -150,8 +169,9 @@ def _mixed(
     seams = state.seams
     while begin < tail:
         end = by_violation(
-            u0, u1, u2, state.links, volume.labels.reshape(-1), volume.material_of, len(volume.materials),
-            mark, moved, strides, volume.low.reshape(-1, 3), volume.high.reshape(-1, 3), queue, begin, tail, w.ends, w.after, w.before, w.key, w.via, *w.bits,
+            u0, u1, u2, state.links, volume.labels.reshape(-1), volume.material_of, len(volume.materials), mark, moved,
+            strides, volume.low.reshape(-1, 3), volume.high.reshape(-1, 3), queue, begin, tail,
+            w.ends, w.after, w.before, w.key, w.via, *w.bits,
         )  # fmt: skip
         tail = over_seams(
             u0, u1, u2, state.links, mark, moved, seams.ends, seams.low, seams.high, -seams.high, -seams.low, queue, end
