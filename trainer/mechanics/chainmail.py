@@ -26,7 +26,7 @@ from numba import njit
 from trainer.mechanics.volume import FREE
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@njit(cache=True, nogil=True, error_model="numpy")
 def consider(u0, u1, u2, mark, moved, e, s, low, high, row):  # type: ignore[no-untyped-def]
     """Move the element ``e`` to within the limits of its sponsor ``s`` and mark it; says whether it had to move.
 

@@ -11,9 +11,10 @@ low ≤ u_b − u_a ≤ high, an element's distance being what is left of the pu
 least move that satisfies all of them. For a move along several axes at once one order has to serve three systems of
 constraints, the largest component deciding; what that leaves over is stated in the tests.
 
-Violations never grow on their way, so the waiting elements are kept in a radix heap (Ahuja, Mehlhorn, Orlin and Tarjan
-1990): bucket b holds the violations whose bits differ from the last one's in bit b − 1 first. Equal violations are
-taken first come, first served.
+Violations never grow on their way, so what waits is kept in a radix heap (Ahuja, Mehlhorn, Orlin and Tarjan 1990):
+bucket b holds the violations whose bits differ from the last one's in bit b − 1 first. A bucket is a chain of blocks,
+in which entries lie side by side. Of equal violations the last to come is taken first. An element may wait several
+times, once for each neighbour that asked more of it than those before; it is moved when the first of these is taken.
 """
 
 from __future__ import annotations
@@ -24,42 +25,47 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from trainer.mechanics.chainmail import consider
 from trainer.mechanics.volume import FREE, Bytes, Indices
 
 #: Buckets: none of the 31 bits differs, or one of them is the first to.
 BUCKETS = 32
+#: Entries of a block.
+BLOCK = 64
 #: The bits of the largest float32; what is left of them sorts the largest violation first.
 LARGEST = 0x7F7FFFFF
-#: In ``via``: the element does not wait.
-NOWHERE = 255
 
 
 @dataclass(frozen=True)
 class Waiting:
-    """The elements that wait, in lists through arrays by element. What was never used takes no memory."""
+    """What waits: entries in blocks. What was never used takes no memory."""
 
-    ends: Indices  # (BUCKETS, 2) first and last element of each bucket's list; a first below 0 is none
-    after: Indices  # (n,) the next in the list; -1 - b after the last of bucket b
-    before: Indices  # (n,) the previous in the list; -1 - b before the first of bucket b
-    key: Indices  # (n,) LARGEST - bits of the violation
-    via: Bytes  # (n,) the direction from the sponsor; NOWHERE if the element does not wait
+    element: Indices  # (p,) who waits
+    key: Indices  # (p,) LARGEST - bits of the violation
+    via: Bytes  # (p,) the direction from the sponsor
+    least: Indices  # (n,) the least key that an element waits with
+    asked: Bytes  # (n,) the mark of the move in which it was asked last
+    following: Indices  # (p // BLOCK,) the next block of a bucket, or of those that are free; -1 is none
+    buckets: Indices  # (BUCKETS, 2) the first block, -1 is none, and how many entries it has; the others are full
     bits: tuple[NDArray[np.float32], Indices]  # (1,) one number, seen as a float and as its bits
 
     @classmethod
     def room(cls, n: int) -> Waiting:
+        """Each of an element's six neighbours can ask once; and each bucket has a block that is not full."""
+        blocks = 6 * n // BLOCK + BUCKETS + 1
         one = np.zeros(1, np.float32)
         return cls(
+            np.empty(blocks * BLOCK, np.int32),
+            np.empty(blocks * BLOCK, np.int32),
+            np.empty(blocks * BLOCK, np.uint8),
+            np.empty(n, np.int32),
+            np.zeros(n, np.uint8),
+            np.empty(blocks, np.int32),
             np.full((BUCKETS, 2), -1, np.int32),
-            np.empty(n, np.int32),
-            np.empty(n, np.int32),
-            np.empty(n, np.int32),
-            np.full(n, NOWHERE, np.uint8),
             (one, one.view(np.int32)),
         )
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _bucket(key, last):  # type: ignore[no-untyped-def]
     """How many bits are left from the first in which two keys differ."""
     x = key ^ last
@@ -79,97 +85,109 @@ def _bucket(key, last):  # type: ignore[no-untyped-def]
     return b + x if x < 2 else b + 2
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _put(e, b, ends, after, before):  # type: ignore[no-untyped-def]
-    """Into bucket ``b``, as its last."""
-    end = ends[b, 1]
-    after[e] = -1 - b
-    if ends[b, 0] < 0:
-        ends[b, 0] = e
-        before[e] = -1 - b
-    else:
-        after[end] = e
-        before[e] = end
-    ends[b, 1] = e
+@njit(cache=True, nogil=True, error_model="numpy")
+def _beyond(apart, low, high):  # type: ignore[no-untyped-def]
+    """How far a difference is beyond its limits; negative is within."""
+    return max(low - apart, apart - high)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _take(e, ends, after, before):  # type: ignore[no-untyped-def]
-    """Out of its bucket."""
-    nearer, further = before[e], after[e]
-    if nearer < 0:
-        ends[-1 - nearer, 0] = further
-    else:
-        after[nearer] = further
-    if further < 0:
-        ends[-1 - further, 1] = nearer
-    else:
-        before[further] = nearer
-
-
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _violation(u, e, s, low, high, row, c):  # type: ignore[no-untyped-def]
-    """How far one component of ``e`` is beyond what its neighbour ``s`` allows; negative is within."""
-    apart = u[e] - u[s]
-    return max(low[row, c] - apart, apart - high[row, c])
-
-
+# Entries are put and taken in place here: arrays handed to a function are counted on the way in and out, which in this
+# loop took longer than all the rest.
 @njit(cache=True, nogil=True, error_model="numpy")
 def by_violation(  # type: ignore[no-untyped-def]
     u0, u1, u2, links, labels, material_of, materials, mark, moved, strides, low, high, queue, begin, tail,
-    ends, after, before, key, via, one, bits,
+    element, key, via, least, asked, following, buckets, one, bits,
 ):  # fmt: skip
     """Move what ``queue[begin:tail]`` asks to move, and what that asks; returns the queue's end."""
     last = np.int64(0)
+    free, fresh = np.int64(-1), np.int64(0)  # the first of the blocks that were given back; the first never used
     head = begin
     while True:
-        while head < tail:  # the neighbours that a moved element asks to move wait, or wait further ahead
+        while head < tail:  # the neighbours that a moved element asks to move wait
             s = queue[head]
             head += 1
             a = np.int64(material_of[labels[s]])
             for d in range(6):
-                if links[s] & (1 << d) == 0:
-                    continue
                 e = s + strides[d]
-                if mark[e] == moved or links[e] & FREE == 0:
+                if links[s] & (1 << d) == 0 or mark[e] == moved or links[e] & FREE == 0:
                     continue
                 row = (a * materials + material_of[labels[e]]) * 6 + d
-                v = max(_violation(u0, e, s, low, high, row, 0), _violation(u1, e, s, low, high, row, 1))
-                v = max(v, _violation(u2, e, s, low, high, row, 2))
+                v = max(
+                    _beyond(u0[e] - u0[s], low[row, 0], high[row, 0]), _beyond(u1[e] - u1[s], low[row, 1], high[row, 1])
+                )
+                v = max(v, _beyond(u2[e] - u2[s], low[row, 2], high[row, 2]))
                 if v <= np.float32(0.0):
                     continue
                 one[0] = v
-                asked = max(np.int64(LARGEST) - bits[0], last)
-                if via[e] != NOWHERE:
-                    if key[e] <= asked:
-                        continue
-                    _take(e, ends, after, before)
-                key[e] = asked
-                via[e] = d
-                _put(e, _bucket(asked, last), ends, after, before)
+                k = max(np.int64(LARGEST) - bits[0], last)
+                if asked[e] == moved and least[e] <= k:
+                    continue
+                asked[e], least[e] = moved, k
+                b = _bucket(k, last)
+                block = np.int64(buckets[b, 0])
+                if block < 0 or buckets[b, 1] == BLOCK:
+                    new = free if free >= 0 else fresh
+                    if free >= 0:
+                        free = np.int64(following[free])
+                    else:
+                        fresh += 1
+                    following[new] = block
+                    buckets[b, 0], buckets[b, 1] = new, 0
+                    block = new
+                at = block * BLOCK + buckets[b, 1]
+                element[at], key[at], via[at] = e, k, d
+                buckets[b, 1] += 1
         b = 0
-        while b < BUCKETS and ends[b, 0] < 0:
+        while b < BUCKETS and buckets[b, 0] < 0:
             b += 1
         if b == BUCKETS:
             return tail
-        if b > 0:
-            e = ends[b, 0]
+        block, count = np.int64(buckets[b, 0]), np.int64(buckets[b, 1])
+        if b > 0:  # the largest violation that waits: its bucket is sorted anew by how the others differ from it
             last = np.int64(LARGEST)
-            while e >= 0:
-                last = min(last, np.int64(key[e]))
-                e = after[e]
-            e = ends[b, 0]
-            ends[b, 0] = -1
-            while e >= 0:
-                further = after[e]
-                _put(e, _bucket(np.int64(key[e]), last), ends, after, before)
-                e = further
-        e = ends[0, 0]
-        _take(e, ends, after, before)
-        d = via[e]
-        via[e] = NOWHERE
-        s = e - strides[d]
-        row = (np.int64(material_of[labels[s]]) * materials + material_of[labels[e]]) * 6 + d
-        if consider(u0, u1, u2, mark, moved, e, s, low, high, row):
-            queue[tail] = e
-            tail += 1
+            old, size = block, count
+            while old >= 0:
+                for at in range(old * BLOCK, old * BLOCK + size):
+                    last = min(last, np.int64(key[at]))
+                old, size = np.int64(following[old]), np.int64(BLOCK)
+            buckets[b, 0] = -1
+            old, size = block, count
+            while old >= 0:
+                for at in range(old * BLOCK, old * BLOCK + size):
+                    if mark[element[at]] == moved:
+                        continue
+                    b = _bucket(np.int64(key[at]), last)
+                    block = np.int64(buckets[b, 0])
+                    if block < 0 or buckets[b, 1] == BLOCK:
+                        new = free if free >= 0 else fresh
+                        if free >= 0:
+                            free = np.int64(following[free])
+                        else:
+                            fresh += 1
+                        following[new] = block
+                        buckets[b, 0], buckets[b, 1] = new, 0
+                        block = new
+                    to = block * BLOCK + buckets[b, 1]
+                    element[to], key[to], via[to] = element[at], key[at], via[at]
+                    buckets[b, 1] += 1
+                done, old, size = old, np.int64(following[old]), np.int64(BLOCK)
+                following[done] = free
+                free = done
+            continue
+        at = block * BLOCK + count - 1
+        buckets[0, 1] = count - 1
+        if count == 1:
+            buckets[0, 0], buckets[0, 1] = following[block], BLOCK
+            following[block] = free
+            free = block
+        e = np.int64(element[at])
+        if mark[e] == moved:
+            continue
+        s = e - strides[via[at]]
+        row = (np.int64(material_of[labels[s]]) * materials + material_of[labels[e]]) * 6 + via[at]
+        u0[e] = min(max(u0[e], u0[s] + low[row, 0]), u0[s] + high[row, 0])
+        u1[e] = min(max(u1[e], u1[s] + low[row, 1]), u1[s] + high[row, 1])
+        u2[e] = min(max(u2[e], u2[s] + low[row, 2]), u2[s] + high[row, 2])
+        mark[e] = moved
+        queue[tail] = e
+        tail += 1

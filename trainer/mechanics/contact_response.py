@@ -119,9 +119,11 @@ def push_out(
     normal = np.divide(way, length, out=np.zeros_like(way), where=length > 1e-9)
     overlap = np.maximum(cell_mm - np.sum((points[other] - points[one]) * normal, axis=1), 0.0)[:, None] * normal
     share = np.where(soft[one] & soft[other], 0.5, 1.0)[:, None]
-    total, times = np.zeros_like(points), np.zeros(len(points))
-    for entries, sign in ((one, -1.0), (other, 1.0)):
-        np.add.at(total, entries, sign * share * overlap)
-        np.add.at(times, entries, 1.0)
-    pushed = np.flatnonzero(soft & (np.abs(total).max(axis=1) > 0.0)).astype(np.int32)
-    return pushed, total[pushed] / times[pushed, None]
+    touched, at = np.unique(pairs, return_inverse=True)
+    at = at.reshape(pairs.shape)
+    total = np.zeros((len(touched), 3))
+    np.add.at(total, at[:, 0], -share * overlap)
+    np.add.at(total, at[:, 1], share * overlap)
+    mean = total / np.bincount(at.ravel(), minlength=len(touched))[:, None]
+    pushed = soft[touched] & np.any(mean != 0.0, axis=1)
+    return touched[pushed].astype(np.int32), mean[pushed]

@@ -57,7 +57,7 @@ def _enter(points, first, low, per_mm, cells, head, cell, after, before):  # typ
                 after[before[s]] = after[s]
             if after[s] >= 0:
                 before[after[s]] = before[s]
-        cell[s] = to
+        cell[s], after[s] = to, -1
         if to >= 0:
             first_there = head[to]
             after[s], before[s] = first_there, -1
@@ -68,24 +68,21 @@ def _enter(points, first, low, per_mm, cells, head, cell, after, before):  # typ
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _touching(body, index, head, cell, after, pairs):  # type: ignore[no-untyped-def]
-    """Pairs of numbers in the same cell, as far as there is room; returns how many."""
+def _touching(body, index, after, pairs):  # type: ignore[no-untyped-def]
+    """Pairs of entries in the same cell, as far as there is room; returns how many. Each meets those after it in its
+    cell's list, so that the cells themselves are not looked at: they are many, and not in the cache."""
     count = 0
-    for s in range(len(cell)):
-        c = cell[s]
-        if c < 0 or (head[c] == s and after[s] < 0):
-            continue
-        t = head[c]
+    for s in range(len(after)):
+        t = after[s]
         while t >= 0:
-            if t > s:
-                apart = body[s] != body[t]
-                if not apart:
-                    for d in range(3):
-                        apart |= abs(index[s, d] - index[t, d]) > APART
-                if apart:
-                    if count < len(pairs):
-                        pairs[count, 0], pairs[count, 1] = s, t
-                    count += 1
+            apart = body[s] != body[t]
+            if not apart:
+                for d in range(3):
+                    apart |= abs(index[s, d] - index[t, d]) > APART
+            if apart:
+                if count < len(pairs):
+                    pairs[count, 0], pairs[count, 1] = min(s, t), max(s, t)
+                count += 1
             t = after[t]
     return count
 
@@ -141,7 +138,7 @@ class OccupancyMap:
     def touching(self) -> np.ndarray:
         """Pairs (k, 2) int32 of entries in the same cell, smaller first; sorted. The next call overwrites them."""
         while True:
-            count = _touching(self.body, self._index, self._head, self._cell, self._after, self._pairs)
+            count = _touching(self.body, self._index, self._after, self._pairs)
             if count <= len(self._pairs):
                 break
             self._pairs = np.zeros((2 * count, 2), dtype=np.int32)

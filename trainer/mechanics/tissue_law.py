@@ -40,7 +40,7 @@ def rest_stiffness(volume: Volume) -> Array:
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@njit(cache=True, nogil=True, error_model="numpy")
 def beyond(strain, most):  # type: ignore[no-untyped-def]
     """What of a strain is beyond the yield strain."""
     return strain - min(max(strain, -most), most)
@@ -84,7 +84,7 @@ def link_answer(law, a, b, axial, strain):  # type: ignore[no-untyped-def]
     return t, k
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _in_series(one, other):  # type: ignore[no-untyped-def]
     """Harmonic mean of two numbers of the same sign; 0 if either is."""
     return 2.0 * one * other / (one + other) if one * other > 0.0 else 0.0

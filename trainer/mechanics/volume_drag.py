@@ -160,6 +160,8 @@ def _mixed(
     if state.waiting is None:
         state.waiting = Waiting.room(volume.labels.size)
     w = state.waiting
+    if state.marks_used == 1:
+        w.asked[:] = 0
     mark, queue, strides = state.mark, state.queue, grid_strides(volume)
     u0[held], u1[held], u2[held] = to.T
     mark[held] = moved
@@ -171,7 +173,7 @@ def _mixed(
         end = by_violation(
             u0, u1, u2, state.links, volume.labels.reshape(-1), volume.material_of, len(volume.materials), mark, moved,
             strides, volume.low.reshape(-1, 3), volume.high.reshape(-1, 3), queue, begin, tail,
-            w.ends, w.after, w.before, w.key, w.via, *w.bits,
+            w.element, w.key, w.via, w.least, w.asked, w.following, w.buckets, *w.bits,
         )  # fmt: skip
         tail = over_seams(
             u0, u1, u2, state.links, mark, moved, seams.ends, seams.low, seams.high, -seams.high, -seams.low, queue, end
