@@ -13,7 +13,7 @@ def test_measure_has_a_row_for_each_method_and_case() -> None:
     cases = [row.case for row in rows]
     assert cases.count("drag of a whole block") == 3
     assert cases.count("growth with the elements that move") == 5
-    assert len(rows) == 3 + 3 + 2 + 2 + 5 + 1 + 1
+    assert len(rows) == 3 + 3 + 2 + 3 + 5 + 1 + 1
     for row in rows:
         assert row.size == (4 * 12**3 if row.case.startswith("four") else 12**3)
         assert row.frames == 0 or row.median_ms > 0.0

@@ -158,15 +158,20 @@ def mixed(side: int, frames: int) -> list[Row]:
     """The same drag of a block in layers of two materials, and of one of one material by lists."""
     two, one = block(side, (TISSUE, FIRM)), block(side)
     held, way = _middle(two), FAR * side * np.array([1.0, 0.7, 0.3])
-    states = [start(two), start(one)]
+    states = {"largest first": start(two), "corrected": start(two), "lists": start(one)}
+
+    def dragging(name: str) -> Step:
+        volume = one if name == "lists" else two
+        return lambda frame: _note(drag(volume, states[name], held, way * (1 - 2 * (frame % 2)), name).count)
+
     methods = [
-        Method("ChainMail, largest violation first", "two materials in layers",
-               lambda f: _note(drag(two, states[0], held, way * (1 - 2 * (f % 2))).count), error_of=LIMITS),
-        Method("ChainMail, lists", "one material",
-               lambda f: _note(drag(one, states[1], held, way * (1 - 2 * (f % 2)), "lists").count), error_of=LIMITS),
+        Method(f"ChainMail, {name}", f"{'one material' if name == 'lists' else 'two materials in layers'}",
+               dragging(name), error_of=LIMITS)
+        for name in states
     ]  # fmt: skip
     rows = in_turn("drag of a block of two materials", side**3, methods, frames)
-    return [_with_error(r, beyond_limits(v, s)) for r, v, s in zip(rows, (two, one), states, strict=True)]
+    volumes = (two, two, one)
+    return [_with_error(r, beyond_limits(v, s)) for r, v, s in zip(rows, volumes, states.values(), strict=True)]
 
 
 def beyond_limits(volume: Volume, state: VolumeState) -> float:

@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from trainer.geometry import Array
 
 if TYPE_CHECKING:
+    from trainer.mechanics.chainmail_corrected import Ring
     from trainer.mechanics.chainmail_mixed import Waiting
 
 Bytes = NDArray[np.uint8]
@@ -139,7 +140,8 @@ class VolumeState:
         None  # lowest and highest index of what was ever moved: elsewhere u is 0
     )
     owed_s: float = 0.0  # time for which relaxation has not yet swept
-    waiting: Waiting | None = None  # room for ChainMail in several materials
+    waiting: Waiting | None = None  # room for ChainMail in several materials, largest violation first
+    ring: Ring | None = None  # the same, corrected
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,8 @@
 
 One free material: lists (:mod:`trainer.mechanics.chainmail`) for a local pull, a scan
 (:mod:`trainer.mechanics.chainmail_scan`) for their longest part when much of a cross-section moves; both put every
-element at the same place to the last bit. Several: largest violation first (:mod:`trainer.mechanics.chainmail_mixed`).
+element at the same place to the last bit. Several: corrected (:mod:`trainer.mechanics.chainmail_corrected`), or, where
+the held elements are pulled different ways, largest violation first (:mod:`trainer.mechanics.chainmail_mixed`).
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from trainer.mechanics.chainmail import cross_section, left_out, lengthwise, over_seams, spread, widen
+from trainer.mechanics.chainmail_corrected import HELD, ROUNDING, Ring, by_correction
 from trainer.mechanics.chainmail_mixed import Waiting, by_violation
 from trainer.mechanics.chainmail_scan import RUN, scan, scan_left_out
 from trainer.mechanics.sharing import parts, share_out
@@ -36,7 +38,7 @@ class Moved:
     """What a move came to."""
 
     count: int  # elements that moved, the held ones included
-    method: str  # lists, scan or mixed
+    method: str  # lists or scan; corrected or largest first
     lowest: Indices  # (3,) lowest i, j, k of what moved
     highest: Indices  # (3,)
 
@@ -157,11 +159,9 @@ def _mixed(
 ) -> tuple[int, str]:
     """ChainMail in several materials; returns how many moved and by which method."""
     u0, u1, u2 = state.u
-    if state.waiting is None:
-        state.waiting = Waiting.room(volume.labels.size)
-    w = state.waiting
-    if state.marks_used == 1:
-        w.asked[:] = 0
+    way = _one_way(state.u[:, held].T, to)
+    if method is None:
+        method = "largest first" if way is None else "corrected"
     mark, queue, strides = state.mark, state.queue, grid_strides(volume)
     u0[held], u1[held], u2[held] = to.T
     mark[held] = moved
@@ -169,15 +169,43 @@ def _mixed(
     begin, tail = 0, len(held)
     box[0::2], box[1::2] = volume.shape, -1
     seams = state.seams
+    tables = (volume.labels.reshape(-1), volume.material_of, len(volume.materials))
+    limits = (volume.low.reshape(-1, 3), volume.high.reshape(-1, 3))
     while begin < tail:
-        end = by_violation(
-            u0, u1, u2, state.links, volume.labels.reshape(-1), volume.material_of, len(volume.materials), mark, moved,
-            strides, volume.low.reshape(-1, 3), volume.high.reshape(-1, 3), queue, begin, tail,
-            w.element, w.key, w.via, w.least, w.asked, w.following, w.buckets, *w.bits,
-        )  # fmt: skip
+        if method == "corrected" and way is not None:
+            if state.ring is None:
+                state.ring = Ring.room(volume.labels.size)
+            r = state.ring
+            r.waits[held] = HELD
+            bound = np.where(way > 0, *limits)
+            slack = np.float32(ROUNDING * np.abs(to).max())
+            end = by_correction(
+                u0, u1, u2, state.links, *tables, mark, moved, strides, bound, way, slack, queue, begin, tail,
+                r.ring, r.waits,
+            )  # fmt: skip
+            r.waits[held] = 0
+        else:
+            if state.waiting is None:
+                state.waiting = Waiting.room(volume.labels.size)
+            w = state.waiting
+            if state.marks_used == 1:
+                w.asked[:] = 0
+            end = by_violation(
+                u0, u1, u2, state.links, *tables, mark, moved, strides, *limits, queue, begin, tail,
+                w.element, w.key, w.via, w.least, w.asked, w.following, w.buckets, *w.bits,
+            )  # fmt: skip
         tail = over_seams(
             u0, u1, u2, state.links, mark, moved, seams.ends, seams.low, seams.high, -seams.high, -seams.low, queue, end
         )
         begin = end
     widen(queue, 0, tail, strides, box)
-    return int(tail), "mixed"
+    return int(tail), method
+
+
+def _one_way(before: np.ndarray, to: np.ndarray) -> np.ndarray | None:
+    """The way (3,) each component of the held is pulled, 1, -1 or 0; None if they are pulled different ways."""
+    way = np.sign(to - before)
+    forward, back = np.any(way > 0, axis=0), np.any(way < 0, axis=0)
+    if np.any(forward & back):
+        return None
+    return np.asarray(forward.astype(np.float32) - back.astype(np.float32))
