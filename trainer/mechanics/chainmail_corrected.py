@@ -3,7 +3,8 @@
 Beside :mod:`trainer.mechanics.chainmail_mixed`. The limits are difference constraints, low ≤ u_b − u_a ≤ high, for each
 component by itself; pulled one way, the least displacements that satisfy all of them are the lengths of longest ways
 from what is held, as the algorithm of Bellman, Ford and Moore finds them: an element that has moved asks its
-neighbours, and one that has moved already is asked again when another way asks more of it, and then asks its own neighbours anew.
+neighbours, and one that has moved already is asked again when another way asks more of it, and then asks its own
+neighbours anew.
 So the result does not depend on the order, and components do not share one. In one material everything is right at
 once and each element moves once, as in the paper; only where stiff tissue overtakes soft an element moves again.
 

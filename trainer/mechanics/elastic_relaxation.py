@@ -37,8 +37,6 @@ from trainer.mechanics.volume import FREE, PRESENT, Indices, Singles, Volume, Vo
 SWEEPS = 8
 #: A region in which no element moves further than this in a sweep, in the shortest rest length, falls asleep.
 STILL = 1e-5
-#: Elements that are looked at together: if each has all its links no one asks which.
-RUN = 32
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -46,24 +44,12 @@ def _smooth_run(u, here, left, right, below, above, behind, ahead, links, wx, wy
     """A run of elements: ``u`` is where they go, the rest where they and their neighbours were; returns how many went
     further than ``still``. Where a link is missing the value that stands for the neighbour is not used."""
     none = np.float32(0.0)
-    size, run = np.uint64(len(u)), np.uint64(RUN)  # unsigned, or each index is asked whether it counts from the end
-    for begin in range(np.uint64(0), size, run):
-        end = min(begin + run, size)
-        every = np.uint8(0xFF)
-        for k in range(begin, end):
-            every &= links[k]
-        if every == np.uint8(0xFF):
-            for k in range(begin, end):
-                x = here[k]
-                pull = wx * ((ahead[k] - x) + (behind[k] - x)) + wy * ((above[k] - x) + (below[k] - x))
-                u[k] = x + (pull + wz * ((right[k] - x) + (left[k] - x)))
-        else:
-            for k in range(begin, end):
-                x, bits = here[k], links[k]
-                pull = wx * ((ahead[k] - x if bits & 1 else none) + (behind[k] - x if bits & 2 else none))
-                pull += wy * ((above[k] - x if bits & 4 else none) + (below[k] - x if bits & 8 else none))
-                pull += wz * ((right[k] - x if bits & 16 else none) + (left[k] - x if bits & 32 else none))
-                u[k] = x + (pull if bits & FREE else none)
+    for k in range(len(u)):
+        x, bits = here[k], links[k]
+        pull = wx * ((ahead[k] - x if bits & 1 else none) + (behind[k] - x if bits & 2 else none))
+        pull += wy * ((above[k] - x if bits & 4 else none) + (below[k] - x if bits & 8 else none))
+        pull += wz * ((right[k] - x if bits & 16 else none) + (left[k] - x if bits & 32 else none))
+        u[k] = x + (pull if bits & FREE else none)
     moving = 0
     if still > none:
         for k in range(len(u)):
