@@ -42,7 +42,6 @@ ORDER = "order: largest difference of a displacement from the published lists', 
 LIMITS = "limits: how far the worst link is beyond its limits, mm"
 NONE = "nothing: no answer is compared"
 PACE = "memory: none, a pace"
-MOVED = "elements that moved, of all"
 
 Step = Callable[[int], None]
 
