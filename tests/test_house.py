@@ -96,6 +96,40 @@ def test_imports_go_one_way(module: Path) -> None:
     assert imported_parts(module) - {part} <= MAY_IMPORT[part]
 
 
+#: Ways to make an array in a kernel.
+MAKERS = {
+    "append", "arange", "argsort", "array", "astype", "concatenate", "copy", "empty", "empty_like", "flatnonzero",
+    "full", "linspace", "nonzero", "ones", "sort", "stack", "unique", "where", "zeros", "zeros_like",
+}  # fmt: skip
+#: Kernels that run once for a topology, or once for a factor, and not at every tick.
+PREPARE = {"nested_dissection", "multifrontal"}
+
+
+def kernels(module: Path) -> list[ast.FunctionDef]:
+    return [
+        f
+        for f in ast.walk(ast.parse(module.read_text(encoding="utf-8")))
+        if isinstance(f, ast.FunctionDef) and any("njit" in ast.unparse(d) for d in f.decorator_list)
+    ]
+
+
+@pytest.mark.parametrize(
+    "module",
+    [m for m in MODULES if part_of(m) in {"mechanics", "interactions"} and m.stem not in PREPARE],
+    ids=lambda m: m.stem,
+)
+def test_what_runs_at_every_tick_makes_no_array(module: Path) -> None:
+    """A small array made in a kernel costs twelve times the work on it: kernels write to what they are given."""
+    made = [
+        f"{kernel.name}, line {call.lineno}: {ast.unparse(call)}"
+        for kernel in kernels(module)
+        for call in ast.walk(kernel)
+        if isinstance(call, ast.List | ast.ListComp)
+        or (isinstance(call, ast.Call) and isinstance(call.func, ast.Attribute) and call.func.attr in MAKERS)
+    ]
+    assert not made
+
+
 def test_no_import_goes_in_a_circle() -> None:
     """The table itself has an order: each part comes after all that it may import."""
     placed: set[str] = set()
