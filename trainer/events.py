@@ -129,6 +129,27 @@ class PullThrough(Event):
 
 
 @dataclass(frozen=True)
+class Drape(Event):
+    """The thread has come to lie over something: an instrument (the tool), a vessel, or itself."""
+
+    kind = "drape"
+    over: str  # instrument, vessel or thread
+    body: str  # vessel, or ""
+    arc_mm: float  # where along needle and thread from the needle's tip
+    point: Vector
+
+
+@dataclass(frozen=True)
+class Undrape(Event):
+    """The thread no longer lies over it: nothing of it has been near for a tenth of a second."""
+
+    kind = "undrape"
+    over: str
+    body: str
+    lay_s: float  # for how long it lay there
+
+
+@dataclass(frozen=True)
 class Break(Event):
     """The thread's tension exceeded its strength."""
 
@@ -231,7 +252,7 @@ class TaskDone(Event):
 KINDS: dict[str, type[Event]] = {
     cls.kind: cls
     for cls in (
-        Grasp, Release, Slip, Drop, Contact, Pierce, Withdraw, PullThrough, Break, Tear, Overforce,
+        Grasp, Release, Slip, Drop, Contact, Pierce, Withdraw, PullThrough, Drape, Undrape, Break, Tear, Overforce,
         TrackingLost, TrackingBack, TickOverrun, TaskStarted, StepDone, Aborted, TaskDone,
     )
 }  # fmt: skip

@@ -16,7 +16,7 @@ from trainer.events import Aborted, Event, StepDone, TaskDone, TaskStarted, Trac
 from trainer.geometry import Array, Rigid, quaternion_from_axes, quaternion_from_euler_deg, slerp
 from trainer.instruments import forceps
 from trainer.instruments.needle import Needle, needle_point, needle_tangent
-from trainer.interactions import giving_way, goal, grasp, holding, pierce, seeing, thread_pull
+from trainer.interactions import drape, giving_way, goal, grasp, holding, pierce, seeing, thread_pull
 from trainer.interactions.world import Jaw, World
 from trainer.mechanics.equilibrium import Equilibrium
 from trainer.mechanics.thread import ThreadModel
@@ -64,6 +64,7 @@ def build(task: Task, tolerance_mN: float = holding.TOLERANCE_MN) -> Scene:
         back = -world.needle_pose.rotate(needle_tangent(world.needle, world.needle.length))
         along = spec.thread.link_mm * np.arange(count)
         world.nodes = thread_pull.swage(world) + along[:, None] * back
+        drape.begin(world)
     return Scene(world, tolerance_mN)
 
 
@@ -183,6 +184,7 @@ class Scene:
         pierce.follow_needle(world, end_s, tool)
         giving_way.relieve(world, end_s)
         thread_pull.settle(world, end_s)
+        drape.tell(world, end_s)
 
     def _lead_needle(self) -> str:
         """Move the needle with the instrument that holds it; its name, or "" when none does."""

@@ -30,6 +30,7 @@ STEER_DEG = 50.0  # inside a lumen the needle is steered to this angle, to leave
 STAND_OFF_MM = 1.5  # an instrument's distance before it reaches for something
 CLEAR_MM = 2.5  # distance from a vessel's axis while moving round it
 BITE_DEPTH_MM = 2.0  # arc beyond a hole at which the other hand takes over
+MOST_REAR_MM = 2.0  # so much further the needle is drawn at most until its rear end is out of the vessel
 TAKE_AT_MM = 0.6  # distance from the tip at which the other hand takes the needle
 TRIES = 5  # at catching needle or thread
 JAW_S = 0.15  # time to open or close the jaws
@@ -216,6 +217,8 @@ class ScriptedHands:
         offset = self._see.needle_from_tool(taking)
         yield from self._follow_arc(taking, offset, self._see.needle_is_through, 1.5 * self._needle_length, 0.5)
         yield from self._follow_arc(taking, offset, lambda: False, 0.5, 0.5, at_end=None)
+        # The rear end leaves the lumen by the cut end, as the needle did: lifted before, it would go through the wall.
+        yield from self._follow_arc(taking, offset, self._see.rear_is_clear, MOST_REAR_MM, 1.0, at_end=None)
         clear = Rigid(self._see.needle().position + 3.0 * self._see.away_from_vessels(), self._see.needle().quaternion)
         yield from self._carry(taking, clear, offset)
 

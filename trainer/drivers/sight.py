@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
 from trainer.curriculum import Task, VesselSpec
 from trainer.geometry import Array, Rigid, cross, unit
 from trainer.view import HoleView, View
 
 ASIDE_DEG = 40.0  # at most this far from the vessel's axis lies the needle's plane
 CLEAR_PAST_MM = 0.06  # distance at which the needle passes the other end of the vessel
+CLEAR_REAR_MM = 0.1  # … and at which its rear end has left a vessel
 RISE = 0.4  # how steeply the thread is pulled away from the vessels
 
 
@@ -53,6 +56,18 @@ class Sight:
 
     def needle_is_through(self) -> bool:
         return all(h.arc_mm > self.needle_length for h in self.view.holes)
+
+    def rear_is_clear(self) -> bool:
+        """Whether the needle's rear end is outside of every vessel, by a wire's thickness and more."""
+        phi = self.needle_length / self.needle_radius
+        rear = self.needle().apply(self.needle_radius * np.array([-math.sin(phi), 1.0 - math.cos(phi), 0.0]))
+        for v in self.task.scene.vessel:
+            origin, _ = self.vessel_origin(v.name)
+            along = float((rear - origin) @ self.view.vessel_axis[v.name])
+            aside = math.dist(rear - origin, along * self.view.vessel_axis[v.name])
+            if -CLEAR_REAR_MM < along < v.length_mm and aside < 0.5 * v.outer_diameter_mm + CLEAR_REAR_MM:
+                return False
+        return True
 
     def task_vessel(self, name: str) -> VesselSpec:
         return next(v for v in self.task.scene.vessel if v.name == name)

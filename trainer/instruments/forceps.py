@@ -32,6 +32,8 @@ ROOT_CLEARANCE_MM = 0.5
 
 _OPEN_ANGLE = math.asin(0.5 * OPEN_GAP_MM / BLADE_MM)
 _STATIONS = 25
+# Where the capsules' axes begin and end along a blade, mm from its axis: the last one at its tip.
+_CAPSULE_STATIONS = np.array([0.0, 4.0, 8.0, BLADE_MM - PLATFORM_MM, BLADE_MM])
 _AROUND = 12
 
 
@@ -63,6 +65,21 @@ def part_poses(world_from_tool: Rigid, closure: float) -> tuple[Array, Array]:
         for side in (1.0, -1.0)
     ]
     return np.array([b.position for b in blades]), np.array([b.quaternion for b in blades])
+
+
+def capsules(world_from_tool: Rigid, closure: float) -> tuple[Array, Array]:
+    """The blades as tapered capsules: the ends (16, 3) mm of eight axes, upper blade first, and the radii (16,) there.
+
+    A capsule's section has the area of a rectangle around the blade's.
+    """
+    half = 0.5 * _blade_angle(closure)
+    c, s = math.cos(half), math.sin(half)
+    ends = np.empty((2, len(_CAPSULE_X), 3))
+    for blade, side in enumerate((1.0, -1.0)):
+        ends[blade, :, 0] = c * _CAPSULE_X - s * _CAPSULE_Y - BLADE_MM
+        ends[blade, :, 1] = side * (s * _CAPSULE_X + c * _CAPSULE_Y)
+    ends[:, :, 2] = 0.0
+    return world_from_tool.apply(ends.reshape(-1, 3)), _CAPSULE_RADIUS
 
 
 def jaw_gap_mm(closure: float) -> float:
@@ -99,3 +116,18 @@ def _upper_blade() -> tuple[Array, np.ndarray]:
     root = np.stack([np.zeros_like(k), k + 1, k], axis=1)
     tip = (_STATIONS - 1) * _AROUND + np.stack([np.zeros_like(k), k, k + 1], axis=1)
     return sections.reshape(-1, 3), np.concatenate([side, root, tip]).astype(np.int32)
+
+
+def _capsules() -> tuple[Array, Array, Array]:
+    """Along the blade (8,), out of the middle plane (8,) and radii (8,) mm of the upper blade's axes' ends."""
+    x = np.repeat(_CAPSULE_STATIONS, 2)[1:-1]
+    taper = 1.0 - x / BLADE_MM
+    width = TIP_WIDTH_MM + (ROOT_WIDTH_MM - TIP_WIDTH_MM) * taper
+    thickness = TIP_THICKNESS_MM + (ROOT_THICKNESS_MM - TIP_THICKNESS_MM) * taper
+    clearance = ROOT_CLEARANCE_MM * np.clip((BLADE_MM - PLATFORM_MM - x) / (BLADE_MM - PLATFORM_MM), 0.0, 1.0)
+    radius = 0.5 * np.sqrt(width * thickness)
+    return np.minimum(x, BLADE_MM - radius[-1]), clearance + 0.5 * thickness, radius
+
+
+_CAPSULE_X, _CAPSULE_Y, _RADII = _capsules()
+_CAPSULE_RADIUS = np.tile(_RADII, 2)

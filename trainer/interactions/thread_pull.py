@@ -16,6 +16,7 @@ import numpy as np
 from trainer.events import Break, Withdraw
 from trainer.geometry import Array, Rigid, cross, quaternion_from_axis_angle, quaternion_multiply, unit
 from trainer.instruments.needle import needle_point
+from trainer.interactions import drape
 from trainer.interactions.pierce import close, draw
 from trainer.interactions.world import Hole, World
 from trainer.mechanics.attachments import Cable
@@ -107,17 +108,29 @@ def cables(world: World, held: Constraints) -> list[tuple[int, int, Cable]]:
             place = held.position[rows.start : rows.stop]
             inside = float(np.sum(np.linalg.norm(np.diff(place, axis=0), axis=1)[channel[:-1]]))
             slots = np.array([h.slot if h is not None else -1 for h in holes], dtype=np.int64)
-            length = float(held.arc[last] - held.arc[first]) - inside
+            round_about = float(np.sum(drape.detours(world, held)[first:last]))
+            length = float(held.arc[last] - held.arc[first]) - inside - round_about
             found.append((first, last, Cable(slots, place, length, channel)))
     return found
 
 
 def settle(world: World, time_s: float) -> None:
-    """Let the thread slide through its holes and lay it from constraint to constraint."""
+    """Let the thread slide through its holes and lay it from constraint to constraint, over what it meets."""
     if world.thread is None:
         return
+    _run_and_lay(world, time_s)
+    for _ in range(drape.TURNS):
+        if world.draping is not None and world.draping.lacks:
+            _run_and_lay(world, time_s, again=True)
+
+
+def _run_and_lay(world: World, time_s: float, again: bool = False) -> None:
+    """``again``: only if the holes can give what is lacking; else the next movement finds the thread too short."""
+    assert world.thread is not None
     held = constraints(world)
-    slid = slide(world.thread, held.arc, held.position, held.hard, world.pieces)
+    slid = slide(world.thread, held.arc, held.position, held.hard, world.pieces, drape.detours(world, held))
+    if again and np.any(slid.shortage > 0.0):
+        return
     for row, hole in enumerate(held.hole):
         if hole is None:
             continue
@@ -142,7 +155,7 @@ def overdrawn(world: World) -> tuple[int, int, Constraints] | None:
     for jaw in world.jaws:
         jaw.lag_mm = 0.0
     held = constraints(world)
-    slid = slide(world.thread, held.arc, held.position, held.hard, world.pieces)
+    slid = slide(world.thread, held.arc, held.position, held.hard, world.pieces, drape.detours(world, held))
     for first, last in runs(world, held):
         lack = float(slid.shortage[first])
         if last - first == 1:
@@ -171,6 +184,7 @@ def lay(world: World, held: Constraints) -> None:
             arc = np.insert(arc, at, world.thread.needle_length + node * world.thread.link)
             position = np.insert(position, at, world.nodes[node], axis=0)
     follow(world.thread, world.nodes, arc, position, world.pieces)
+    drape.over(world, held)
     if not needle_is_placed(world):
         _trail(world)
 

@@ -21,6 +21,7 @@ from trainer.instruments.needle import Needle
 from trainer.mechanics.equilibrium import Equilibrium
 from trainer.mechanics.quasi_newton import at_points
 from trainer.mechanics.thread import ThreadModel
+from trainer.mechanics.thread_drape import Drape
 
 
 @dataclass(frozen=True)
@@ -87,6 +88,22 @@ class Jaw:
 
 
 @dataclass
+class Draping:
+    """The thread's contact, and what of the last movement it needs in the next."""
+
+    contact: Drape
+    nodes: Array  # (n, 3) mm, the thread's when the movement began
+    x: Array  # (n, 3) mm, the tissue's then
+    blades: Array  # (2 k, 3) mm, the ends of the blades' axes then
+    blades_now: Array
+    points: dict[str, Array] = field(default_factory=dict)  # (3,) mm, where the thread was held then
+    held_at: dict[str, Array] = field(default_factory=dict)  # (3,) mm, and where it is now
+    detour: dict[tuple[str, str], float] = field(default_factory=dict)  # mm, from one constraint to the next
+    lacks: bool = False  # whether a span drawn tight over something has yet to get the thread for it
+    lying: dict[int, tuple[float, float]] = field(default_factory=dict)  # body → since, and last touched, s
+
+
+@dataclass
 class World:
     """Everything that a step reads and changes."""
 
@@ -109,6 +126,7 @@ class World:
     passes: int = 0
     broken: bool = False  # the thread, in this session
     before: Array = field(default_factory=lambda: np.zeros((0, 3)))  # tissue before its last movement
+    draping: Draping | None = None
     tension_mN: float = 0.0  # of the thread between two grips
     tissue_force_mN: float = 0.0  # largest force of an instrument on tissue in the last movement
     tick: int = 0

@@ -131,7 +131,7 @@ class Cells:
         self._last_segment = int(self._segments.max(initial=-1))
         self._last_triangle = int(self._triangles.max(initial=-1))
         self._check_indices(None, x)
-        self._order, self._node_begin, self._nodes = _blocks(self._triangles, x)
+        self._order, self._node_begin, self._nodes = blocks(self._triangles, x)
         if len(self._segments):
             self._grid = SegmentGrid(self._segments)
         self._stamp = np.zeros(len(self._segments), dtype=np.int64)
@@ -184,7 +184,7 @@ class Cells:
             raise ValueError(f"surface: triangles name node {self._last_triangle}, found {len(surface)} nodes")
 
 
-def _blocks(triangles: np.ndarray, x: Array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def blocks(triangles: np.ndarray, x: Array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Triangles that lie together in blocks of ``BLOCK``.
 
     Returns the order (f,) of the triangles, where each block's nodes begin (blocks + 1,), and the nodes.

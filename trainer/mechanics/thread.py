@@ -98,6 +98,7 @@ def slide(
     constraint_position: Array,
     hard: NDArray[np.bool_],
     pieces: Array,
+    detour: Array | None = None,
 ) -> Slid:
     """Let the thread run through soft constraints so that no span is stretched, with the least total sliding.
 
@@ -105,7 +106,8 @@ def slide(
     arcs stay, the order stays, and a hole slides only when it must. Between two hard constraints with less
     thread than the straight way through their holes no sliding helps: the holes then share the thread in
     proportion to the distances, and the lack is reported. A constraint outside every piece, as on the
-    needle or on a lost link, stays as it is. Raises ValueError for constraints out of order.
+    needle or on a lost link, stays as it is. ``detour`` (c,) mm: by how much the way from a constraint to the next one
+    is longer than the straight one, round what the thread lies over. Raises ValueError for constraints out of order.
     """
     old, points = _constraints(constraint_arc, constraint_position)
     arcs = old.copy()
@@ -117,6 +119,7 @@ def slide(
         np.ascontiguousarray(hard, dtype=np.bool_),
         pieces,
         SNAP * model.link,
+        np.zeros(len(old)) if detour is None else detour,
         old,
         shortage,
         pulled_out,

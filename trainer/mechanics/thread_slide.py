@@ -61,6 +61,7 @@ def slide_piece(
     begin: int,
     end: int,
     tolerance: float,
+    detour: Array,
     shortage: Array,
     work: Array,
 ) -> None:
@@ -74,7 +75,7 @@ def slide_piece(
                 points[k, 1] - points[k - 1, 1],
                 points[k, 2] - points[k - 1, 2],
             )
-            travelled[k] = travelled[k - 1] + math.sqrt(dx * dx + dy * dy + dz * dz)
+            travelled[k] = travelled[k - 1] + math.sqrt(dx * dx + dy * dy + dz * dz) + detour[k - 1]
         y[k] = arcs[k] - travelled[k]
     k = begin
     while k < end:
@@ -115,6 +116,7 @@ def slide_kernel(
     hard: NDArray[np.bool_],
     pieces: Array,
     tolerance: float,
+    detour: Array,
     old: Array,
     shortage: Array,
     pulled_out: NDArray[np.bool_],
@@ -138,7 +140,7 @@ def slide_kernel(
             for k in range(begin, end):
                 arcs[k] = old[k]
                 shortage[k] = 0.0
-            slide_piece(arcs, points, hard, begin, end, tolerance, shortage, work)
+            slide_piece(arcs, points, hard, begin, end, tolerance, detour, shortage, work)
             before = s0 - arcs[begin]
             beyond = arcs[end - 1] - s1
             if max(before, beyond) <= tolerance:

@@ -9,6 +9,7 @@ from datetime import datetime
 from trainer.events import (
     Break,
     Contact,
+    Drape,
     Drop,
     Event,
     Grasp,
@@ -24,6 +25,7 @@ from trainer.events import (
     TickOverrun,
     TrackingBack,
     TrackingLost,
+    Undrape,
     Withdraw,
     payload,
 )
@@ -104,6 +106,10 @@ def _held(target: str, body: str) -> str:
     return f"{target} of {body}" if body else target
 
 
+def _lain_over(over: str, body: str) -> str:
+    return body or {"instrument": "the instrument", "thread": "itself"}.get(over, over)
+
+
 def unseen(events: Sequence[TrackingLost | TrackingBack]) -> str:
     """How long one hand was out of the device's sight, of its losses and returns in a row."""
     returns = [e.lost_s for e in events if isinstance(e, TrackingBack)]
@@ -133,6 +139,10 @@ def describe(event: Event) -> str:
             return f"{event.end} out of the {event.wall} wall of {event.body}"
         case PullThrough():
             return f"{event.wall} wall of {event.body}"
+        case Drape():
+            return f"thread over {_lain_over(event.over, event.body)}"
+        case Undrape():
+            return f"thread off {_lain_over(event.over, event.body)} after {event.lay_s:.1f} s"
         case Break():
             return f"thread at {event.tension_mN:.0f} mN"
         case Tear():
