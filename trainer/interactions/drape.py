@@ -74,7 +74,7 @@ def over(world: World, held: Constraints) -> None:
     tool = np.repeat(np.arange(tools, dtype=np.int32), len(ends) // (2 * tools))
     keys = names(held)
     before = [draping.points.get(key, p) for key, p in zip(keys, held.position, strict=True)]
-    lack, lies = draping.contact.lay(
+    lack, way = draping.contact.lay(
         world.nodes, draping.nodes, world.pieces, held.arc, held.position,
         np.array(before).reshape(-1, 3), np.array([h is not None for h in held.hole], dtype=np.bool_), _channels(world, held),
         draping.x, draping.x if world.solver is None else world.solver.x, Blades(draping.blades, ends, radius, tool, np.array(arcs), moved), IN_JAWS_MM,
@@ -83,13 +83,12 @@ def over(world: World, held: Constraints) -> None:
     for k in range(len(keys) - 1):
         span = keys[k], keys[k + 1]
         known = draping.detour.pop(span, 0.0)
+        longer = max(0.0, float(way[k]) - float(np.linalg.norm(held.position[k + 1] - held.position[k])))
         if lack[k] > 0.0:
             draping.lacks = True
-            draping.detour[span] = known + (1.0 + MORE) * float(lack[k]) + MORE_MM
-        elif lies[k] and known > 0.0:
-            # A way round it as long as the thread is now there is.
-            chord = float(np.linalg.norm(held.position[k + 1] - held.position[k]))
-            draping.detour[span] = min(known, float(held.arc[k + 1] - held.arc[k]) - chord)
+            draping.detour[span] = max(known, longer) + (1.0 + MORE) * float(lack[k]) + MORE_MM
+        elif known > 0.0 and longer > 0.0:
+            draping.detour[span] = min(known, longer)
 
 
 def detours(world: World, held: Constraints) -> Array:

@@ -244,18 +244,36 @@ def _pass(line, m, crossed, through, before):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _tell(line, m, touches, count, tools, vessels, lack, lies, near):  # type: ignore[no-untyped-def]
-    """Which spans lie over something and lack thread, and how near each body is to the thread, and where."""
+def _tell(line, m, touches, count, tools, vessels, seat, lack, way, near):  # type: ignore[no-untyped-def]
+    """What spans lack, how long the way is through what they touch, how near each body is to the thread, and where.
+
+    ``seat`` (m,) is scratch: where along a link it touches.
+    """
+    x = line.x
+    seat[:m] = -1.0
+    for k in range(count):
+        if _gap(x, touches, k) < LIES_MM:
+            seat[touches.row[k]] = touches.place[k, 0]
+            if touches.other[k] >= 0:
+                seat[touches.other[k]] = touches.place[k, 1]
     r = 0
     while r < m:
         first, last, begun, ended = _span(line, m, r)
         r = last + 1
-        if first < m and begun and ended:
-            k = line.held[first - 1]
-            deepest = _deepest(line, first, last, touches, count)
-            lies[k] = deepest < LIES_MM
-            if deepest >= -TOLERANCE_MM:
-                lack[k] = 0.0
+        if first == m or not (begun and ended):
+            continue
+        held = line.held[first - 1]
+        if _deepest(line, first, last, touches, count) >= -TOLERANCE_MM:
+            lack[held] = 0.0
+        px, py, pz = x[first - 1, 0], x[first - 1, 1], x[first - 1, 2]
+        for q in range(first - 1, last + 2):
+            s = seat[q] if q <= last else 0.0
+            if s >= 0.0:
+                nx, ny, nz = x[q, 0], x[q, 1], x[q, 2]
+                if s > 0.0:
+                    nx, ny, nz = nx + s * (x[q + 1, 0] - nx), ny + s * (x[q + 1, 1] - ny), nz + s * (x[q + 1, 2] - nz)
+                way[held] += math.sqrt((nx - px) ** 2 + (ny - py) ** 2 + (nz - pz) ** 2)
+                px, py, pz = nx, ny, nz
     near[:, 0] = math.inf
     for k in range(count):
         b, r = touches.body[k], touches.row[k]
@@ -272,11 +290,11 @@ def _tell(line, m, touches, count, tools, vessels, lack, lies, near):  # type: i
 @njit(cache=True, nogil=True, error_model="numpy")
 def drape_kernel(  # type: ignore[no-untyped-def]
     nodes, before, origin, link, pieces, arcs, points, points_before, holes, channel, through, radius,
-    walls, x0, x1, blades, free_mm, friction, line, pairs, touches, crossed, weight, kept, u, trial, lack, lies, near,
+    walls, x0, x1, blades, free_mm, friction, line, pairs, touches, crossed, weight, kept, u, trial, lack, way, near,
 ):  # fmt: skip
     """``Drape.lay`` on plain arrays; returns False, with nothing changed, where there is too little room."""
     lack[:] = 0.0
-    lies[:] = False
+    way[:] = 0.0
     tools, vessels = blades.grip.shape[0], walls.deep.shape[0]
     m = lay_rows(
         line, nodes, before, origin, link, pieces, arcs, points, points_before, holes, channel, through, radius
@@ -301,7 +319,7 @@ def drape_kernel(  # type: ignore[no-untyped-def]
     if pairs.used[3] > touches.row.shape[0]:
         return False
     _pass(line, m, crossed, through, pairs.near)
-    _tell(line, m, touches, pairs.used[3], tools, vessels, lack, lies, near)
+    _tell(line, m, touches, pairs.used[3], tools, vessels, weight, lack, way, near)
     for r in range(m):
         if line.free[r]:
             for d in range(3):
@@ -352,16 +370,16 @@ class Drape:
     def lay(
         self, nodes: Array, before: Array, pieces: Array, arcs: Array, points: Array, points_before: Array,
         holes: np.ndarray, channel: Ints, x0: Array, x1: Array, blades: Blades, free_mm: float,
-    ) -> tuple[Array, np.ndarray]:  # fmt: skip
+    ) -> tuple[Array, Array]:  # fmt: skip
         """Lay the thread's ``nodes`` (n, 3) mm, in place, over what they met in a movement from ``before``.
 
         Constraints as in ``thread.follow``, with their ``points_before`` (c, 3); ``holes`` (c,) bool; ``channel`` (c,):
         the vessel in whose wall the thread runs from a constraint to the next, or -1. The tissue went from ``x0`` to
-        ``x1`` (n, 3). Returns for each constraint the thread that the span to the next one lacks, mm, and whether that
-        span lies over something. ``self.near`` (bodies, 5) tells of each tool, vessel and the thread itself the least
+        ``x1`` (n, 3). Returns for each constraint, (c,) mm, the thread that the span to the next one lacks, and how long
+        the way to it is from touch to touch, straight between them. ``self.near`` (bodies, 5) tells of each tool, vessel and the thread itself the least
         gap, and the arc and place there; inf where it is further than ``thread_search.MARGIN_MM``.
         """
-        lack, lies = np.zeros(len(arcs)), np.zeros(len(arcs), dtype=np.bool_)
+        lack, way = np.zeros((2, len(arcs)))
         while True:
             through = self._through.copy()
             rows = self._model.count + len(arcs) + 1
@@ -371,8 +389,8 @@ class Drape:
                 nodes, before, self._model.needle_length, self._model.link, pieces, arcs, points, points_before,
                 holes, channel, through, self._radius, self._walls, x0, x1, blades, free_mm,
                 self._friction, self._line, self._pairs, self._touches, self._crossed, self._weight, self._kept, self._u, self._trial,
-                lack, lies, self.near,
+                lack, way, self.near,
             ):  # fmt: skip
                 self._through = through
-                return lack, lies
+                return lack, way
             self._make_room(len(self._weight), 2 * len(self._pairs.wall))

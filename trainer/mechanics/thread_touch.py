@@ -25,8 +25,9 @@ from trainer.mechanics.continuous_collision import EDGE_EDGE, POINT_TRIANGLE, cr
 from trainer.mechanics.thread_line import Ints
 from trainer.mechanics.thread_search import MARGIN_MM
 
-#: A foot may be this far outside of its triangle, in weights, so that none falls between two.
-EDGE = 1e-6
+#: A foot may be this far outside of its triangle, in weights: under the edge of two facets that lean towards one another
+#: there is a wedge in which a point has its foot on neither.
+EDGE = 0.1
 #: Two bodies nearer than this, mm, have no direction between them.
 TOGETHER_MM = 1e-9
 
