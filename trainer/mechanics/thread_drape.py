@@ -346,8 +346,8 @@ def surface(triangles: Ints, vessel: Ints, hull: Ints, wall_mm: Array, x: Array)
     # Outwards of an edge is what lies under both planes: the middles of its triangles are below one another's.
     way = corners.mean(axis=1)[neighbour] - corners.mean(axis=1)[:, None]
     convex = np.einsum("fkd,fd->fk", way, normal) < 0.0
-    sharp = convex & (np.einsum("fkd,fd->fk", normal[neighbour], normal) <= SHARP)
-    sharp &= neighbour > np.arange(len(triangles))[:, None]
+    sharp = (convex & (np.einsum("fkd,fd->fk", normal[neighbour], normal) <= SHARP)).astype(np.int32)
+    sharp[neighbour > np.arange(len(triangles))[:, None]] *= 2
     return Walls(
         triangles.astype(np.int32), sharp, neighbour, vessel.astype(np.int32), hull.astype(np.int32), 0.5 * wall_mm, *blocks(triangles, x)
     )

@@ -29,7 +29,7 @@ class Walls(NamedTuple):
     """The closed surface of the tissue's walls; normals point out of the wall. Does not change."""
 
     triangles: Ints  # (f, 3)
-    sharp: NDArray[np.bool_]  # (f, 3) whether the edge from corner k to k + 1 is sharp, and this triangle's to look after
+    sharp: Ints  # (f, 3) of the edge from corner k to k + 1: 0 for blunt, else sharp, and 2 for one triangle of the two
     outwards: Ints  # (f, 3) the triangle beyond that edge
     vessel: Ints  # (f,)
     hull: Ints  # (f,) 1 for the outer, 2 for the inner, 0 for what joins them

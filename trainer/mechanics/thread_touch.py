@@ -25,9 +25,9 @@ from trainer.mechanics.continuous_collision import EDGE_EDGE, POINT_TRIANGLE, cr
 from trainer.mechanics.thread_line import Ints
 from trainer.mechanics.thread_search import MARGIN_MM
 
-#: A foot may be this far outside of its triangle, in weights: under the edge of two facets that lean towards one another
+#: A foot may be this far beyond a blunt edge of its triangle, in weights: behind two facets that lean towards one another
 #: there is a wedge in which a point has its foot on neither.
-EDGE = 0.1
+WEDGE = 0.1
 #: Two bodies nearer than this, mm, have no direction between them.
 TOGETHER_MM = 1e-9
 
@@ -155,10 +155,14 @@ def _touch_wall(line, r, f, walls, x0, x1, tools, pairs, touches, crossed):  # t
         at, height = (r, h0) if end == 0 else (r + 1, h1)
         if line.free[at] and line.wall[at] != vessel and -walls.deep[vessel] < height < MARGIN_MM + line.skin[at]:
             b, c = _foot(x[at, 0], x[at, 1], x[at, 2], x1, i, j, k)
-            if b >= -EDGE and c >= -EDGE and b + c <= 1.0 + EDGE:
+            if (
+                c >= (-WEDGE if walls.sharp[f, 0] == 0 else 0.0)
+                and b + c <= (1.0 + WEDGE if walls.sharp[f, 1] == 0 else 1.0)
+                and b >= (-WEDGE if walls.sharp[f, 2] == 0 else 0.0)
+            ):
                 _plane(line, r, float(end), f, walls, x0, x1, b, c, nx, ny, nz, tools, pairs.used, touches)
     for e in range(3):
-        if walls.sharp[f, e]:
+        if walls.sharp[f, e] == 2:
             gx, gy, gz = face_normal(x1, walls.triangles, walls.outwards[f, e])
             _edge(line, r, f, e, walls, x0, x1, nx + gx, ny + gy, nz + gz, tools, pairs, touches)
     if (h0 > 0.0) != (h1 > 0.0) and line.away[r] > 0.0 and line.away[r + 1] > 0.0:
@@ -287,7 +291,7 @@ def sweep(line, walls, x0, x1, tools, pairs, touches):  # type: ignore[no-untype
         if line.inside[r] == vessel:
             continue
         for e in range(3):
-            if not walls.sharp[f, e]:
+            if walls.sharp[f, e] != 2:
                 continue
             gx, gy, gz = face_normal(x1, walls.triangles, walls.outwards[f, e])
             for c in range(2):
