@@ -7,6 +7,7 @@ more thread than the straight way between its ends: the *detour*, which its hole
 
 from __future__ import annotations
 
+import itertools
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,6 +32,8 @@ LEAP_MM = 0.5
 TURNS = 2
 #: What a tightened detour is lengthened by beyond what was lacking, so that few turns are needed: a share, and mm.
 MORE, MORE_MM = 0.25, 1e-3
+#: … but by no more than a movement can have lengthened the way, mm.
+MOST_MORE_MM = 0.1
 #: The thread lies over what it touches this closely, and no longer over what it is further from than that, mm …
 TOUCHES_MM, LIFTED_MM = 0.002, 0.04
 #: … for this long, s. All assumed.
@@ -80,15 +83,15 @@ def over(world: World, held: Constraints) -> None:
         draping.x, draping.x if world.solver is None else world.solver.x, Blades(draping.blades, ends, radius, tool, np.array(arcs), moved), IN_JAWS_MM,
     )  # fmt: skip
     draping.lacks, draping.held_at = False, dict(zip(keys, held.position, strict=True))
-    for k in range(len(keys) - 1):
-        span = keys[k], keys[k + 1]
-        known = draping.detour.pop(span, 0.0)
+    known, draping.detour = draping.detour, {}
+    for k, span in enumerate(itertools.pairwise(keys)):
+        so_far = known.get(span, 0.0)
         longer = max(0.0, float(way[k]) - float(np.linalg.norm(held.position[k + 1] - held.position[k])))
         if lack[k] > 0.0:
             draping.lacks = True
-            draping.detour[span] = max(known, longer) + (1.0 + MORE) * float(lack[k]) + MORE_MM
-        elif known > 0.0 and longer > 0.0:
-            draping.detour[span] = min(known, longer)
+            draping.detour[span] = max(so_far, longer) + min((1.0 + MORE) * float(lack[k]) + MORE_MM, MOST_MORE_MM)
+        elif so_far > 0.0 and longer > 0.0:
+            draping.detour[span] = min(so_far, longer)
 
 
 def detours(world: World, held: Constraints) -> Array:

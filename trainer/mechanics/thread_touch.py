@@ -28,6 +28,8 @@ from trainer.mechanics.thread_search import MARGIN_MM
 #: A foot may be this far beyond a blunt edge of its triangle, in weights: behind two facets that lean towards one another
 #: there is a wedge in which a point has its foot on neither.
 WEDGE = 0.1
+#: A point of a link of which less than this part is free, next to a held row, cannot give way and touches nothing.
+GIVES = 0.3
 #: Two bodies nearer than this, mm, have no direction between them.
 TOGETHER_MM = 1e-9
 
@@ -75,6 +77,12 @@ def _between(x, i, s, d):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _gives(line, r, s):  # type: ignore[no-untyped-def]
+    """Whether the point s of link r can give way."""
+    return (1.0 - s) * line.free[r] + s * line.free[r + 1] >= GIVES
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def face_normal(x, triangles, f):  # type: ignore[no-untyped-def]
     """Unit normal of a triangle by the right-hand rule; zeros where it has no area."""
     i, j, k = triangles[f, 0], triangles[f, 1], triangles[f, 2]
@@ -104,6 +112,8 @@ def _foot(px, py, pz, x, i, j, k):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True, error_model="numpy")
 def _plane(line, r, s, f, walls, x0, x1, b, c, nx, ny, nz, tools, used, touches):  # type: ignore[no-untyped-def]
     """The point s of link r stays over the point of triangle f with the weights b and c."""
+    if not _gives(line, r, s):
+        return
     i, j, k = walls.triangles[f, 0], walls.triangles[f, 1], walls.triangles[f, 2]
     a = 1.0 - b - c
     qx = a * x1[i, 0] + b * x1[j, 0] + c * x1[k, 0]
@@ -199,6 +209,8 @@ def _touch_blade(line, r, k, blades, radius, pairs, touches):  # type: ignore[no
         reach = radius + (1.0 - t) * blades.radius[i] + t * blades.radius[j]
     elif distance > reach + MARGIN_MM:
         return
+    if not _gives(line, r, s):
+        return
     qx = (1.0 - t) * blades.end[i, 0] + t * blades.end[j, 0]
     qy = (1.0 - t) * blades.end[i, 1] + t * blades.end[j, 1]
     qz = (1.0 - t) * blades.end[i, 2] + t * blades.end[j, 2]
@@ -218,6 +230,8 @@ def _touch_itself(line, r, q, radius, body, pairs, touches):  # type: ignore[no-
     if before > 0.0 and nx * mx + ny * my + nz * mz <= 0.0:
         s, t, nx, ny, nz = s0, t0, mx, my, mz
     elif distance > 2.0 * radius + MARGIN_MM:
+        return
+    if not (_gives(line, r, s) or _gives(line, q, t)):
         return
     _add(
         touches, pairs.used, r, q, s, t, nx, ny, nz, 2.0 * radius,
