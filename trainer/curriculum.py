@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from trainer import config
 from trainer.config import ANGLE_DEG, LENGTH_MM, POSITION_MM, Bounds, ConfigError, Sourced
@@ -21,6 +21,7 @@ Vector = tuple[float, float, float]
 
 FORCE_MN = {"bounds": Bounds(0.0, 1e6, low_open=True)}
 DRAG_MN = {"bounds": Bounds(0.0, 1e6)}
+SUTURES = "sutures.toml"
 MOST_LINKS = 10_000  # assumed: a hundred times those of a stitch
 
 
@@ -76,10 +77,18 @@ class NeedleSpec:
 
 
 @dataclass(frozen=True)
+class Suture:
+    """A size in ``curricula/sutures.toml``."""
+
+    diameter_mm: Sourced = field(metadata=LENGTH_MM)
+    strength_mN: Sourced = field(metadata=FORCE_MN)
+
+
+@dataclass(frozen=True)
 class ThreadSpec:
     """The suture behind the needle: short rigid links (Brown 2001, section 4)."""
 
-    size: str  # USP size
+    size: str  # USP size, of those in curricula/sutures.toml: it says diameter and strength where the task does not
     length_mm: float = field(metadata=LENGTH_MM)
     link_mm: float = field(metadata=LENGTH_MM)
     diameter_mm: Sourced = field(metadata=LENGTH_MM)
@@ -227,7 +236,30 @@ class TaskFile:
 
 def parse_task(text: str, name: str) -> Task:
     """The task in a TOML text. Raises ConfigError."""
-    return config.build(Task, config.parse_toml(text, name), name)
+    return _task(config.parse_toml(text, name), name)
+
+
+def _task(table: dict[str, Any], name: str) -> Task:
+    """The task in a TOML table; what it does not say of its thread is that of the suture's size."""
+    scene = table.get("scene")
+    thread = scene.get("thread") if isinstance(scene, dict) else None
+    if isinstance(thread, dict) and "size" in thread:
+        known = sutures()
+        if thread["size"] not in known:
+            raise ConfigError(
+                f"{name}: 'scene.thread.size' must be one of {', '.join(map(repr, known))} (curricula/{SUTURES}), "
+                f"found {thread['size']!r}"
+            )
+        suture = known[thread["size"]]
+        filled = {key: {"value": s.value, "source": s.source} for key, s in vars(suture).items()}
+        table = {**table, "scene": {**table["scene"], "thread": {**filled, **thread}}}
+    return config.build(Task, table, name)
+
+
+def sutures() -> dict[str, Suture]:
+    """The sizes of sutures that a task can name, the thickest first. Raises ConfigError."""
+    path = data_folder("curricula") / SUTURES
+    return {size: config.build(Suture, table, str(path), size) for size, table in config.read_toml(path).items()}
 
 
 def load_task(reference: str) -> TaskFile:
@@ -272,7 +304,11 @@ def check(path: Path, check_task: Callable[[Task], None]) -> list[str]:
                 for t in family.tasks
                 if not (path.parent / f"{t}.toml").exists()
             ]
-        task = config.build(Task, table, str(path))
+        if path.name == SUTURES:
+            for size, suture in table.items():
+                config.build(Suture, suture, str(path), size)
+            return []
+        task = _task(table, str(path))
     except ConfigError as error:
         return [str(error)]
     problems = []

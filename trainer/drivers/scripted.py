@@ -216,9 +216,8 @@ class ScriptedHands:
         taking = 1 - driving
         offset = self._see.needle_from_tool(taking)
         yield from self._follow_arc(taking, offset, self._see.needle_is_through, 1.5 * self._needle_length, 0.5)
-        yield from self._follow_arc(taking, offset, lambda: False, 0.5, 0.5, at_end=None)
         # The rear end leaves the lumen by the cut end, as the needle did: lifted before, it would go through the wall.
-        yield from self._follow_arc(taking, offset, self._see.rear_is_clear, MOST_REAR_MM, 1.0, at_end=None)
+        yield from self._follow_arc(taking, offset, self._see.rear_is_clear, MOST_REAR_MM, 0.5, at_end=None)
         clear = Rigid(self._see.needle().position + 3.0 * self._see.away_from_vessels(), self._see.needle().quaternion)
         yield from self._carry(taking, clear, offset)
 

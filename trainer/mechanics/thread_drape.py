@@ -146,9 +146,7 @@ def _close_span(line, first, last, link, u, trial, kept):  # type: ignore[no-unt
         u[j, 0], u[j, 1], u[j, 2] = dx / size, dy / size, dz / size
     cx, cy, cz = x[last, 0] - x[first, 0], x[last, 1] - x[first, 1], x[last, 2] - x[first, 2]
     total = line.arc[last] - line.arc[first]
-    if cx * cx + cy * cy + cz * cz >= total * total or not close_directions(
-        u, trial, links, d0, link, d1, cx, cy, cz
-    ):
+    if cx * cx + cy * cy + cz * cz >= total * total or not close_directions(u, trial, links, d0, link, d1, cx, cy, cz):
         for r in range(first + 1, last):
             for e in range(3):
                 x[r, e] = kept[r, e]
@@ -349,7 +347,13 @@ def surface(triangles: Ints, vessel: Ints, hull: Ints, wall_mm: Array, x: Array)
     sharp = (convex & (np.einsum("fkd,fd->fk", normal[neighbour], normal) <= SHARP)).astype(np.int32)
     sharp[neighbour > np.arange(len(triangles))[:, None]] *= 2
     return Walls(
-        triangles.astype(np.int32), sharp, neighbour, vessel.astype(np.int32), hull.astype(np.int32), 0.5 * wall_mm, *blocks(triangles, x)
+        triangles.astype(np.int32),
+        sharp,
+        neighbour,
+        vessel.astype(np.int32),
+        hull.astype(np.int32),
+        0.5 * wall_mm,
+        *blocks(triangles, x),
     )
 
 
@@ -388,8 +392,8 @@ class Drape:
             if drape_kernel(
                 nodes, before, self._model.needle_length, self._model.link, pieces, arcs, points, points_before,
                 holes, channel, through, self._radius, self._walls, x0, x1, blades, free_mm,
-                self._friction, self._line, self._pairs, self._touches, self._crossed, self._weight, self._kept, self._u, self._trial,
-                lack, way, self.near,
+                self._friction, self._line, self._pairs, self._touches, self._crossed, self._weight,
+                self._kept, self._u, self._trial, lack, way, self.near,
             ):  # fmt: skip
                 self._through = through
                 return lack, way

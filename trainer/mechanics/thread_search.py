@@ -25,6 +25,7 @@ RUN = 8
 #: Links nearer than this along the thread, in links, do not touch one another.
 APART = 3
 
+
 class Walls(NamedTuple):
     """The closed surface of the tissue's walls; normals point out of the wall. Does not change."""
 
@@ -68,12 +69,10 @@ class Pairs(NamedTuple):
 
 def no_pairs(rows: int, pairs: int) -> Pairs:
     """Room for ``pairs`` candidates of each sort among ``rows`` rows."""
-    lists = [np.zeros((pairs, 2), dtype=np.int32) for _ in range(3)]
-    runs = rows // RUN + 1
-    return Pairs(
-        *lists, np.zeros(4, dtype=np.int64), *np.zeros((2, rows, 3)), *np.zeros((2, runs, 3)),
-        np.zeros(rows, dtype=np.int32), np.zeros((4, 4, 3)), np.zeros(7),
-    )  # fmt: skip
+    wall, blade, itself = (np.zeros((pairs, 2), dtype=np.int32) for _ in range(3))
+    (low, high), (run_low, run_high) = np.zeros((2, rows, 3)), np.zeros((2, rows // RUN + 1, 3))
+    used, near = np.zeros(4, dtype=np.int64), np.zeros(rows, dtype=np.int32)
+    return Pairs(wall, blade, itself, used, low, high, run_low, run_high, near, np.zeros((4, 4, 3)), np.zeros(7))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

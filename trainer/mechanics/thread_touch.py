@@ -25,8 +25,8 @@ from trainer.mechanics.continuous_collision import EDGE_EDGE, POINT_TRIANGLE, cr
 from trainer.mechanics.thread_line import Ints
 from trainer.mechanics.thread_search import MARGIN_MM
 
-#: A foot may be this far beyond a blunt edge of its triangle, in weights: behind two facets that lean towards one another
-#: there is a wedge in which a point has its foot on neither.
+#: A foot may be this far beyond a blunt edge of its triangle, in weights: behind two facets that lean towards one
+#: another there is a wedge in which a point has its foot on neither.
 WEDGE = 0.1
 #: A point of a link of which less than this part is free, next to a held row, cannot give way and touches nothing.
 GIVES = 0.3
@@ -324,7 +324,8 @@ def sweep(line, walls, x0, x1, tools, pairs, touches):  # type: ignore[no-untype
             if size < TOGETHER_MM:
                 continue
             outwards = mx * (nx + gx) + my * (ny + gy) + mz * (nz + gz)
-            size = size if outwards > 0.0 else -size
+            if outwards <= 0.0:
+                size = -size
             gap = 0.0
             for d in range(3):
                 way = _between(line.x, r, s, d) - (1.0 - w) * end[2, d] - w * end[3, d]
