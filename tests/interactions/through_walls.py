@@ -42,13 +42,15 @@ def depth(point: Array, x: Array, triangles: np.ndarray) -> float:
     return float(np.min(np.where(inside, np.abs(height), nearest)))
 
 
-def in_walls(world: World) -> tuple[list[int], float]:
-    """The nodes that lie in a wall, and the greatest depth, mm, to which the thread does between nodes.
+def in_walls(world: World) -> tuple[float, float]:
+    """The greatest depth, mm, to which a node lies in a wall, and to which the thread does between nodes.
 
     Left out is the thread between the holes through which it goes into a wall and out of it: it is a pass's stretch
     from one hull to the other, or from a hull to the needle that is still in the other.
     """
-    assert world.thread is not None and world.needle is not None and world.tissue is not None
+    assert world.thread is not None
+    assert world.needle is not None
+    assert world.tissue is not None
     assert world.solver is not None
     arcs, swage = world.thread.arcs(), world.needle.length
     channels: list[tuple[int, float, float]] = []
@@ -57,8 +59,7 @@ def in_walls(world: World) -> tuple[list[int], float]:
             ends = [h.arc for h in world.open_holes() if (h.pass_number, h.place.vessel) == (number, v)]
             if len(ends) == 2:
                 channels.append((v, min(ends), max(ends)))
-    found: list[int] = []
-    deepest = 0.0
+    found = deepest = 0.0
     for v, vessel in enumerate(world.tissue.vessels):
         x = world.solver.x[world.tissue.nodes(v)]
         free = np.ones(len(arcs), dtype=bool)
@@ -70,7 +71,8 @@ def in_walls(world: World) -> tuple[list[int], float]:
             rows = np.flatnonzero((arcs >= a - 1e-9) & (arcs <= b + 1e-9) & free & (arcs > swage))
             near = rows[((world.nodes[rows] >= low) & (world.nodes[rows] <= high)).all(axis=1)]
             if len(near):
-                found += near[np.abs(winding(world.nodes[near], x, vessel.display_triangles)) > 0.5].tolist()
+                for i in near[np.abs(winding(world.nodes[near], x, vessel.display_triangles)) > 0.5]:
+                    found = max(found, depth(world.nodes[i], x, vessel.display_triangles))
             # Links both of whose nodes are free and between which no hole or grip is.
             held = np.array([h.arc for h in world.open_holes()] + [j.arc for j in world.jaws if j.target == "thread"])
             for i in rows[:-1]:

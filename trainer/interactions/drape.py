@@ -16,8 +16,8 @@ from trainer import events
 from trainer.geometry import Array
 from trainer.instruments import forceps
 from trainer.interactions.world import Draping, World
-from trainer.mechanics.thread_drape import Drape, surface
-from trainer.mechanics.thread_search import Blades
+from trainer.mechanics.thread_drape import Drape
+from trainer.mechanics.thread_search import Blades, surface
 
 if TYPE_CHECKING:
     from trainer.interactions.thread_pull import Constraints
@@ -77,10 +77,12 @@ def over(world: World, held: Constraints) -> None:
     tool = np.repeat(np.arange(tools, dtype=np.int32), len(ends) // (2 * tools))
     keys = names(held)
     before = [draping.points.get(key, p) for key, p in zip(keys, held.position, strict=True)]
+    holes = np.array([h is not None for h in held.hole], dtype=np.bool_)
+    now = draping.x if world.solver is None else world.solver.x
+    blades = Blades(draping.blades, ends, radius, tool, np.array(arcs), moved)
     lack, way = draping.contact.lay(
-        world.nodes, draping.nodes, world.pieces, held.arc, held.position,
-        np.array(before).reshape(-1, 3), np.array([h is not None for h in held.hole], dtype=np.bool_), _channels(world, held),
-        draping.x, draping.x if world.solver is None else world.solver.x, Blades(draping.blades, ends, radius, tool, np.array(arcs), moved), IN_JAWS_MM,
+        world.nodes, draping.nodes, world.pieces, held.arc, held.position, np.array(before).reshape(-1, 3), holes,
+        _channels(world, held), draping.x, now, blades, IN_JAWS_MM,
     )  # fmt: skip
     draping.lacks, draping.held_at = False, dict(zip(keys, held.position, strict=True))
     known, draping.detour = draping.detour, {}

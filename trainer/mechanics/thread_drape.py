@@ -19,7 +19,6 @@ import numpy as np
 from numba import njit
 
 from trainer.geometry import Array
-from trainer.mechanics.cells import blocks
 from trainer.mechanics.thread import ThreadModel
 from trainer.mechanics.thread_closure import close_directions
 from trainer.mechanics.thread_follow import one_sided
@@ -27,8 +26,6 @@ from trainer.mechanics.thread_line import Ints, lay_rows, no_line
 from trainer.mechanics.thread_search import Blades, Walls, no_pairs, search
 from trainer.mechanics.thread_touch import no_touches, sweep, touch
 
-#: Cosine of the angle between the normals of two facets up to which their edge, at rest, is sharp.
-SHARP = math.cos(math.radians(20.0))
 #: Nothing is moved for what is less deep than this, mm: a twelfth of the radius of a 10-0 thread.
 TOLERANCE_MM = 1e-3
 #: Projections of all touches and lengths, and how often what is near is looked for again.
@@ -118,6 +115,9 @@ def project(line, m, weight, touches, count, friction):  # type: ignore[no-untyp
             x[r, 0], x[r, 1], x[r, 2] = x[r, 0] + a * dx, x[r, 1] + a * dy, x[r, 2] + a * dz
             x[r + 1, 0], x[r + 1, 1], x[r + 1, 2] = x[r + 1, 0] - b * dx, x[r + 1, 1] - b * dy, x[r + 1, 2] - b * dz
         for k in range(count):
+            r, q = touches.row[k], touches.other[k]
+            if weight[r] + weight[r + 1] == 0.0 and (q < 0 or weight[q] + weight[q + 1] == 0.0):
+                continue
             push = max(0.0, touches.push[k] - _gap(x, touches, k))
             change = push - touches.push[k]
             if change != 0.0 and _move(
@@ -134,7 +134,7 @@ def project(line, m, weight, touches, count, friction):  # type: ignore[no-untyp
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _close_span(line, first, last, link, u, trial, kept):  # type: ignore[no-untyped-def]
-    """Exact lengths between the rows ``first`` and ``last``, which stay; what cannot be closed goes back to ``kept``."""
+    """Exact lengths between the rows ``first`` and ``last``, which stay; else what is between goes back to ``kept``."""
     x, links = line.x, last - first
     d0, d1 = line.length[first], line.length[last - 1]
     for j in range(links):
@@ -158,7 +158,7 @@ def _close_span(line, first, last, link, u, trial, kept):  # type: ignore[no-unt
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _span(line, m, r):  # type: ignore[no-untyped-def]
-    """The next rows from ``r`` on that are free together: first, last, whether one is held before, and after; or m."""
+    """The next rows from ``r`` on that are free together: first, last, whether one before, and after, is held."""
     while r < m and not line.free[r]:
         r += 1
     first = r
@@ -325,38 +325,6 @@ def drape_kernel(  # type: ignore[no-untyped-def]
     return True
 
 
-def surface(triangles: Ints, vessel: Ints, hull: Ints, wall_mm: Array, x: Array) -> Walls:
-    """The closed surface ``triangles`` (f, 3) of walls ``wall_mm`` (vessels,) thick, of ``vessel`` (f,), at ``x`` (n, 3).
-
-    ``hull`` (f,): 1 for the outer one, 2 for the inner one, 0 for what joins them.
-
-    Raises ValueError where an edge has not two triangles that turn the same way round.
-    """
-    edges = {(int(t[k]), int(t[(k + 1) % 3])): f for f, t in enumerate(triangles) for k in range(3)}
-    try:
-        beside = [[edges[int(t[(k + 1) % 3]), int(t[k])] for k in range(3)] for t in triangles]
-    except KeyError as edge:
-        raise ValueError(f"the walls' surface is not closed at the edge {edge}") from None
-    neighbour = np.array(beside, dtype=np.int32).reshape(-1, 3)
-    corners = x[triangles]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    # Outwards of an edge is what lies under both planes: the middles of its triangles are below one another's.
-    way = corners.mean(axis=1)[neighbour] - corners.mean(axis=1)[:, None]
-    convex = np.einsum("fkd,fd->fk", way, normal) < 0.0
-    sharp = (convex & (np.einsum("fkd,fd->fk", normal[neighbour], normal) <= SHARP)).astype(np.int32)
-    sharp[neighbour > np.arange(len(triangles))[:, None]] *= 2
-    return Walls(
-        triangles.astype(np.int32),
-        sharp,
-        neighbour,
-        vessel.astype(np.int32),
-        hull.astype(np.int32),
-        0.5 * wall_mm,
-        *blocks(triangles, x),
-    )
-
-
 class Drape:
     """What a thread of ``model`` with ``radius`` mm lies over: ``walls``, and the blades of ``tools`` instruments."""
 
@@ -379,9 +347,10 @@ class Drape:
 
         Constraints as in ``thread.follow``, with their ``points_before`` (c, 3); ``holes`` (c,) bool; ``channel`` (c,):
         the vessel in whose wall the thread runs from a constraint to the next, or -1. The tissue went from ``x0`` to
-        ``x1`` (n, 3). Returns for each constraint, (c,) mm, the thread that the span to the next one lacks, and how long
-        the way to it is from touch to touch, straight between them. ``self.near`` (bodies, 5) tells of each tool, vessel and the thread itself the least
-        gap, and the arc and place there; inf where it is further than ``thread_search.MARGIN_MM``.
+        ``x1`` (n, 3). Returns for each constraint, (c,) mm, the thread that the span to the next one lacks, and how
+        long the way to it is from touch to touch, straight between them. ``self.near`` (bodies, 5) tells of each tool,
+        vessel and the thread itself the least gap, and the arc and place there; inf where it is further than
+        ``thread_search.MARGIN_MM``.
         """
         lack, way = np.zeros((2, len(arcs)))
         while True:

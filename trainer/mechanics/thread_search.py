@@ -15,13 +15,15 @@ from numba import njit
 from numpy.typing import NDArray
 
 from trainer.geometry import Array
-from trainer.mechanics.cells import BLOCK
+from trainer.mechanics.cells import BLOCK, blocks
 from trainer.mechanics.thread_line import Ints
 
 #: Boxes are larger by this, mm: as far as contact may move a link, and as far off as one is still told to lie over.
 MARGIN_MM = 0.05
 #: Links in a run.
 RUN = 8
+#: Cosine of the angle between the normals of two facets up to which their edge, at rest, is sharp.
+SHARP = math.cos(math.radians(20.0))
 #: Links nearer than this along the thread, in links, do not touch one another.
 APART = 3
 
@@ -65,6 +67,38 @@ class Pairs(NamedTuple):
     near: Ints  # (m,) scratch
     four: Array  # (4, 4, 3) scratch
     times: Array  # (7,) scratch
+
+
+def surface(triangles: Ints, vessel: Ints, hull: Ints, wall_mm: Array, x: Array) -> Walls:
+    """The closed surface ``triangles`` (f, 3) of walls ``wall_mm`` (vessels,) thick; ``vessel`` (f,); ``x`` (n, 3) mm.
+
+    ``hull`` (f,): 1 for the outer one, 2 for the inner one, 0 for what joins them.
+
+    Raises ValueError where an edge has not two triangles that turn the same way round.
+    """
+    edges = {(int(t[k]), int(t[(k + 1) % 3])): f for f, t in enumerate(triangles) for k in range(3)}
+    try:
+        beside = [[edges[int(t[(k + 1) % 3]), int(t[k])] for k in range(3)] for t in triangles]
+    except KeyError as edge:
+        raise ValueError(f"the walls' surface is not closed at the edge {edge}") from None
+    neighbour = np.array(beside, dtype=np.int32).reshape(-1, 3)
+    corners = x[triangles]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    # Outwards of an edge is what lies under both planes: the middles of its triangles are below one another's.
+    way = corners.mean(axis=1)[neighbour] - corners.mean(axis=1)[:, None]
+    convex = np.einsum("fkd,fd->fk", way, normal) < 0.0
+    sharp = (convex & (np.einsum("fkd,fd->fk", normal[neighbour], normal) <= SHARP)).astype(np.int32)
+    sharp[neighbour > np.arange(len(triangles))[:, None]] *= 2
+    return Walls(
+        triangles.astype(np.int32),
+        sharp,
+        neighbour,
+        vessel.astype(np.int32),
+        hull.astype(np.int32),
+        0.5 * wall_mm,
+        *blocks(triangles, x),
+    )
 
 
 def no_pairs(rows: int, pairs: int) -> Pairs:

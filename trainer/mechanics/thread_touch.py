@@ -283,7 +283,7 @@ def sweep(line, walls, x0, x1, tools, pairs, touches):  # type: ignore[no-untype
     start, end, now, normal = pairs.four[0], pairs.four[1], pairs.four[2], pairs.four[3, 0]
     for p in range(used[0]):
         r, f = pairs.wall[p, 0], pairs.wall[p, 1]
-        vessel, t = walls.vessel[f], walls.triangles[f]
+        vessel, corners = walls.vessel[f], walls.triangles[f]
         ax, ay, az = face_normal(x0, walls.triangles, f)
         nx, ny, nz = face_normal(x1, walls.triangles, f)
         for finish in range(2 if line.length[r + 1] < 0.0 else 1):
@@ -297,8 +297,8 @@ def sweep(line, walls, x0, x1, tools, pairs, touches):  # type: ignore[no-untype
             _put(start, 0, line.start, at)
             _put(end, 0, line.x, at)
             for c in range(3):
-                _put(start, 1 + c, x0, t[c])
-                _put(end, 1 + c, x1, t[c])
+                _put(start, 1 + c, x0, corners[c])
+                _put(end, 1 + c, x1, corners[c])
             time, b, c, side = crossing(POINT_TRIANGLE, start, end, now, normal, pairs.times)
             if time <= 1.0 and side >= 0:
                 _plane(line, r, float(finish), f, walls, x0, x1, b, c, nx, ny, nz, tools, used, touches)
@@ -311,8 +311,8 @@ def sweep(line, walls, x0, x1, tools, pairs, touches):  # type: ignore[no-untype
             for c in range(2):
                 _put(start, c, line.start, r + c)
                 _put(end, c, line.x, r + c)
-                _put(start, 2 + c, x0, t[(e + c) % 3])
-                _put(end, 2 + c, x1, t[(e + c) % 3])
+                _put(start, 2 + c, x0, corners[(e + c) % 3])
+                _put(end, 2 + c, x1, corners[(e + c) % 3])
             time, s, w, side = crossing(EDGE_EDGE, start, end, now, normal, pairs.times)
             if not time <= 1.0 or side == 0:
                 continue
@@ -323,13 +323,12 @@ def sweep(line, walls, x0, x1, tools, pairs, touches):  # type: ignore[no-untype
             size = math.sqrt(mx * mx + my * my + mz * mz)
             if size < TOGETHER_MM:
                 continue
-            outwards = mx * (nx + gx) + my * (ny + gy) + mz * (nz + gz)
-            if outwards <= 0.0:
+            if mx * (nx + gx) + my * (ny + gy) + mz * (nz + gz) <= 0.0:
                 size = -size
             gap = 0.0
             for d in range(3):
                 way = _between(line.x, r, s, d) - (1.0 - w) * end[2, d] - w * end[3, d]
                 gap += (mx if d == 0 else (my if d == 1 else mz)) / size * way
             if gap < 0.0:
-                b, c = (w, 0.0) if e == 0 else ((1.0 - w, w) if e == 1 else (0.0, 1.0 - w))
-                _plane(line, r, s, f, walls, x0, x1, b, c, mx / size, my / size, mz / size, tools, used, touches)
+                wb, wc = (w, 0.0) if e == 0 else ((1.0 - w, w) if e == 1 else (0.0, 1.0 - w))
+                _plane(line, r, s, f, walls, x0, x1, wb, wc, mx / size, my / size, mz / size, tools, used, touches)
