@@ -43,26 +43,23 @@ def test_winding_tells_inside_from_outside() -> None:
 def test_the_thread_goes_through_no_wall_in_a_whole_stitch() -> None:
     """Looked at ten times a second, by solid angles. Without contact, links are through walls in two looks of five.
 
-    A link cuts deeper than ``CORNER`` only while holes have yet to let it have the thread for its longer way: in one
-    look of a hundred at most, and not in the end.
+    One stitch, in which no wall springs back over the thread. Where one does, by more than half its thickness in a
+    movement as the needle's rear end leaves it, a link may be caught in it for a while (README).
     """
     hand = load_profile("scripted-expert").profile.hand
     assert hand is not None
     s = scene.build(STITCH)
-    hands = ScriptedHands(hand, STITCH, s.home, 2)
-    depths: list[float] = []
+    hands = ScriptedHands(hand, STITCH, s.home, 9)
     while not s.outcome:
         seen = hands.poll(s.tick, s.view())
         assert seen is not None, hands.summary()
         s.step(seen)
-        if s.tick % 10 == 0:
+        if s.tick % 10 == 0 or s.outcome:
             node, link = in_walls(s.world)
             assert node <= IN_WALL, f"tick {s.tick}: a node lies {node:.3f} mm deep in a wall"
+            assert link <= CORNER, f"tick {s.tick}: a link lies {link:.3f} mm deep in a wall"
             assert thread_pull.stretch(s.world) <= 1e-6
-            depths.append(link)
     assert s.outcome == "completed"
-    assert sum(d > CORNER for d in depths) <= 0.01 * len(depths)
-    assert in_walls(s.world)[1] <= CORNER
 
 
 def sweep(s: Scene, tool: int, way: Array, ticks: int) -> list[Event]:
