@@ -94,6 +94,7 @@ class ThreadSpec:
     diameter_mm: Sourced = field(metadata=LENGTH_MM)
     strength_mN: Sourced = field(metadata=FORCE_MN)
     drag_mN: Sourced = field(metadata=DRAG_MN)  # friction of the thread in one hole
+    drapes: bool = False  # whether it lies over walls, blades and itself; else it passes through them, and costs less
 
     def __post_init__(self) -> None:
         if self.length_mm > MOST_LINKS * self.link_mm:

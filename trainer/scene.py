@@ -64,7 +64,8 @@ def build(task: Task, tolerance_mN: float = holding.TOLERANCE_MN) -> Scene:
         back = -world.needle_pose.rotate(needle_tangent(world.needle, world.needle.length))
         along = spec.thread.link_mm * np.arange(count)
         world.nodes = thread_pull.swage(world) + along[:, None] * back
-        drape.begin(world)
+        if spec.thread.drapes:
+            drape.begin(world)
     return Scene(world, tolerance_mN)
 
 

@@ -9,7 +9,7 @@ import pytest
 from through_walls import depth, in_walls, winding
 
 from trainer import scene
-from trainer.curriculum import load_task
+from trainer.curriculum import Task, load_task
 from trainer.drivers.scripted import ScriptedHands
 from trainer.events import Drape, Event, Undrape
 from trainer.geometry import Array
@@ -20,7 +20,14 @@ from trainer.poses import ToolPoses
 from trainer.profile import load_profile
 from trainer.scene import Scene
 
-STITCH = load_task("anastomosis/single-stitch").task
+
+def draping(task: Task) -> Task:
+    """The task with a thread that lies over things."""
+    assert task.scene.thread is not None
+    return replace(task, scene=replace(task.scene, thread=replace(task.scene.thread, drapes=True)))
+
+
+STITCH = draping(load_task("anastomosis/single-stitch").task)
 RADIUS = 0.0125  # of a 10-0 thread, mm
 #: How deep a node may lie in a wall, mm. It keeps its skin from it, which next to a hole is half of its distance to the
 #: hole along the thread, to ``TOLERANCE_MM``: a node nearer than 2 µm to a hole may be 1 µm in; three times that for
