@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from performing import one_drive, perform, record_of
 
-from trainer.curriculum import load_task
+from trainer.curriculum import Task, load_task
 from trainer.drivers.hand_motion import Tremor, along_arc, needle_pose
 from trainer.drivers.scripted import TURN
 from trainer.geometry import unit
@@ -22,12 +22,15 @@ COMMANDS = [
 ]
 
 
-@pytest.mark.parametrize("wander_mm", [0.0, 1.5])
-def test_no_hand_leaps(wander_mm: float) -> None:
+@pytest.mark.parametrize(
+    ("task", "wander_mm"),
+    [(load_task("anastomosis/single-stitch").task, 0.0), (one_drive(), 1.5)],
+    ids=["stitch", "drive"],
+)
+def test_no_hand_leaps(task: Task, wander_mm: float) -> None:
     """Between two ticks an instrument goes no further than its speed, at the peak of a minimum-jerk movement (15/8 of
     the mean), and its turning let it: what is turned lies within the needle's length of the jaws. A detour adds the
     steepest part of sin² to a way that is given the time for it: pi/2 of its mean."""
-    task = load_task("anastomosis/single-stitch").task
     hand = Hand(wander_mm=wander_mm)
     at = np.array([p.position for p in perform(task, hand, seed=3).poses])
     assert task.scene.needle is not None
