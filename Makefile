@@ -17,8 +17,9 @@ demo: $(INSTALLED)
 	@echo "Recording: $(DEMO_RRD)    (.venv/bin/rerun $(DEMO_RRD))"
 	@echo "rerun sends usage statistics to its makers unless told not to: .venv/bin/rerun analytics disable"
 
+# A file of tests stays with one worker: each kernel is compiled once, not once for every worker.
 test: lint
-	$(BIN)/python -m pytest -q -n auto
+	$(BIN)/python -m pytest -q -n auto --dist loadfile
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .
