@@ -38,17 +38,37 @@ class Hand:
     source: str = ""  # where the numbers come from
 
 
+@dataclass(frozen=True, kw_only=True)
+class Mount:
+    """How a sensor is fixed to the instrument that it moves."""
+
+    closure: float = field(default=1.0, metadata={"bounds": Bounds(0.0, 1.0)})  # jaws, where nothing measures them
+    position_mm: Vector = field(default=(0.0, 0.0, 0.0), metadata=POSITION_MM)  # sensor_from_tool
+    rotation_deg: Vector = field(default=(0.0, 0.0, 0.0), metadata=ANGLE_DEG)  # about x, then y, then z
+
+
+@dataclass(frozen=True, kw_only=True)
+class Placement:
+    """How a device's poses enter the scene.
+
+    world = anchor · scene_from_device · (scale · position, rotation) · sensor_from_tool.
+    """
+
+    scale: float = field(default=1.0, metadata={"bounds": Bounds(1e-6, 1e6)})  # of positions
+    position_mm: Vector = field(default=(0.0, 0.0, 0.0), metadata=POSITION_MM)  # scene_from_device
+    rotation_deg: Vector = field(default=(0.0, 0.0, 0.0), metadata=ANGLE_DEG)  # about x, then y, then z
+    anchor: Literal["home", "none"] = "none"  # home: the first sample of a tool is where the task has it wait
+    distortion: Distortion | None = None  # of the tracker's field; usually from a calibration
+
+
 @dataclass(frozen=True)
-class Sensor:
+class Sensor(Mount):
     """One tracked sensor of a recording and the instrument it moves."""
 
     name: str
     tool: Literal["left", "right"]
-    closure: float = field(default=1.0, metadata={"bounds": Bounds(0.0, 1.0)})  # jaws, where none are recorded
     jaw_open_deg: float | None = field(default=None, metadata=ANGLE_DEG)  # where an angle of the jaws is recorded:
     jaw_closed_deg: float | None = field(default=None, metadata=ANGLE_DEG)  # at which they are open, and closed
-    position_mm: Vector = field(default=(0.0, 0.0, 0.0), metadata=POSITION_MM)  # sensor_from_tool
-    rotation_deg: Vector = field(default=(0.0, 0.0, 0.0), metadata=ANGLE_DEG)  # about x, then y, then z
 
     def __post_init__(self) -> None:
         if (self.jaw_open_deg is None) != (self.jaw_closed_deg is None):
@@ -58,33 +78,25 @@ class Sensor:
 
 
 @dataclass(frozen=True)
-class RecordingSpec:
-    """How a recorded motion enters the scene: world = anchor · scale · (position, rotation) · device."""
+class RecordingSpec(Placement):
+    """How a recorded motion enters the scene."""
 
     path: str = ""  # usually given by --device PATH
     sensor: tuple[Sensor, ...] = ()
-    scale: float = field(default=1.0, metadata={"bounds": Bounds(1e-6, 1e6)})  # of positions
-    position_mm: Vector = field(default=(0.0, 0.0, 0.0), metadata=POSITION_MM)
-    rotation_deg: Vector = field(default=(0.0, 0.0, 0.0), metadata=ANGLE_DEG)  # about x, then y, then z
-    anchor: Literal["home", "none"] = "none"  # home: the first sample of a tool is where the task has it wait
-    distortion: Distortion | None = None  # of the tracker's field; usually from a calibration
 
 
 @dataclass(frozen=True)
-class Bird:
+class Bird(Mount):
     """One unit of the flock and the instrument that its sensor is fixed to."""
 
     address: int = field(metadata={"bounds": Bounds(1, 14)})  # as its switches say
     tool: Literal["left", "right"]
     port: str = ""  # its own; empty: it reports through the flock's port
-    closure: float = field(default=1.0, metadata={"bounds": Bounds(0.0, 1.0)})  # jaws, where no sensor measures them
-    position_mm: Vector = field(default=(0.0, 0.0, 0.0), metadata=POSITION_MM)  # sensor_from_tool
-    rotation_deg: Vector = field(default=(0.0, 0.0, 0.0), metadata=ANGLE_DEG)  # about x, then y, then z
 
 
 @dataclass(frozen=True)
-class MinibirdSpec:
-    """A flock of miniBIRDs: world = anchor · scene_from_device · (scale · position, rotation) · sensor_from_tool."""
+class MinibirdSpec(Placement):
+    """A flock of miniBIRDs."""
 
     bird: tuple[Bird, ...]
     port: str = ""  # of the flock, in group mode: /dev/ttyUSB0, or any address that pyserial knows
@@ -93,11 +105,6 @@ class MinibirdSpec:
     hemisphere: Literal["forward", "aft", "lower", "upper", "right", "left"] = "forward"
     quaternion: Literal["measured", "direct", "inverse"] = "measured"  # whose rotation is sent: compared with angles
     reset: bool = False  # by RTS at the start; needs a cable that has it
-    scale: float = field(default=1.0, metadata={"bounds": Bounds(1e-6, 1e6)})  # of positions
-    position_mm: Vector = field(default=(0.0, 0.0, 0.0), metadata=POSITION_MM)
-    rotation_deg: Vector = field(default=(0.0, 0.0, 0.0), metadata=ANGLE_DEG)  # about x, then y, then z
-    anchor: Literal["home", "none"] = "none"  # home: the first sample of a tool is where the task has it wait
-    distortion: Distortion | None = None  # of the transmitter's field; usually from a calibration
 
     def __post_init__(self) -> None:
         if not self.bird:
