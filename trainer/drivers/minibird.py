@@ -1,40 +1,30 @@
 """miniBIRDs and a closure sensor as the instruments of a session.
 
-The loop takes the newest pose of each bird and never waits for one. A bird without a fresh sample that is not flawed
-counts as not seen: the scene leaves the instrument where it is, jaws and all, and the summary says why and how long.
+A bird without a fresh sample that is not flawed counts as not seen (:mod:`trainer.drivers.in_hand`).
 """
 
 from __future__ import annotations
 
 import sys
-import time
-from array import array
 from collections.abc import Sequence
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from trainer.config import ConfigError
-from trainer.drivers import field_distortion
 from trainer.drivers.clock_line import ClockLine
 from trainer.drivers.closure import ClosureSensor
+from trainer.drivers.in_hand import SWITCH_S, Latency, Losses, Pace, Placer
 from trainer.drivers.minibird_flock import UNHURRIED, Silences
 from trainer.drivers.minibird_record import Sample
 from trainer.drivers.minibird_stream import FlockStream
-from trainer.geometry import Rigid, quaternion_conjugate, quaternion_from_euler_deg
+from trainer.geometry import quaternion_conjugate
 from trainer.poses import ToolPoses
 from trainer.profile import Bird, ClosureSpec, MinibirdSpec
 
 #: A sample older than this no longer says where the hand is: ten records in a row, assumed.
 STALE_S = 0.1
-#: The stream's first sample may take this long after the session began.
-FIRST_S = 0.5
-#: How long a thread computes before it lets one that has read something have a turn; 5 ms by default. Assumed.
-SWITCH_S = 0.0005
-#: As many losses are told one by one; a worse session is told by their number.
-MOST_LOSSES = 100
-MOST_REASONS = 4  # of one loss
 
 
 @dataclass
@@ -46,9 +36,6 @@ class _Instrument:
     newest: Sample | None = None  # the last without flaw; written by the thread that reads
     flaw: str = ""  # of the last sample; written by the same thread
     used: Sample | None = None
-    anchor: Rigid | None = None
-    lost_tick: int | None = None
-    reasons: list[str] = field(default_factory=list)  # why, as far as it is known by now
 
 
 class Minibird:
@@ -64,25 +51,20 @@ class Minibird:
         silences: Silences = UNHURRIED,
     ) -> None:
         """Connects and configures; the stream begins with the first poll. Raises ConfigError, DeviceError."""
-        self._spec = spec
-        self._scene_from_device = Rigid(np.array(spec.position_mm), quaternion_from_euler_deg(spec.rotation_deg))
+        self._placer = Placer(spec, home)
         self._instruments = [_Instrument(bird, tools.index(bird.tool)) for bird in spec.bird if bird.tool in tools]
         if not self._instruments:
             raise ConfigError(
                 f"the device moves {', '.join(b.tool for b in spec.bird)}; the task has {', '.join(tools)}"
             )
         self._by_address = {instrument.bird.address: instrument for instrument in self._instruments}
-        self._tick_s = 1.0 / tick_hz
+        self._pace = Pace(tick_hz)
         self._home = home
         self._position, self._quaternion = home.position.copy(), home.quaternion.copy()
         self._jaws = home.closure.copy()
-        self._begun_s: float | None = None
         self._line = ClockLine(1.0 / spec.rate_hz)
-        self._latency_ms = array("d")  # from a pose's first byte to its tick's events, of each pose that was used
-        self._fresh: list[Sample] = []  # poses that this tick uses and none used before
-        self._ticks = 0
-        self._losses: list[dict[str, object]] = []
-        self._lost_count = 0
+        self._latency = Latency()
+        self._losses = Losses(self._pace.tick_s)
         with ExitStack() as opened:
             self._closure = opened.enter_context(closing(ClosureSensor(closure))) if closure is not None else None
             self._stream = opened.enter_context(closing(FlockStream(spec, self._take, silences)))
@@ -106,30 +88,22 @@ class Minibird:
 
     def poll(self, tick: int, view: object) -> ToolPoses | None:
         """The newest poses. Where nobody else paces the session, waits until the tick is due."""
-        now = time.monotonic()
-        if self._begun_s is None:
-            self._begun_s = now
+        if self._pace.begun_s is None:
             self._stream.start()
-        # Half a tick early is early enough: a clock that paces the session has waited already.
-        ahead_s = self._begun_s + (tick - 0.5) * self._tick_s - now
-        if ahead_s > 0.0:
-            time.sleep(ahead_s)
-            now = time.monotonic()
-        self._ticks = tick
-        self._fresh.clear()
+        now = self._pace.wait(tick)
+        self._latency.begin()
         valid = np.asarray(self._home.valid, dtype=bool).copy()
         for instrument in self._instruments:
             reason = self._follow(instrument, now)
             valid[instrument.tool] = not reason
-            self._note(instrument, tick, reason)
+            self._losses.note(instrument.bird.tool, tick, reason)
         return ToolPoses(self._position.copy(), self._quaternion.copy(), self._jaws.copy(), valid)
 
     def _follow(self, instrument: _Instrument, now: float) -> str:
         """Bring an instrument to where its bird is; "" or why that is not known."""
         sample, k, tool = instrument.newest, instrument.tool, instrument.bird.tool
-        assert self._begun_s is not None
         if sample is None:
-            return "" if now - self._begun_s <= FIRST_S else self._stream.trouble or "the stream does not start"
+            return "" if self._pace.starting(now) else self._stream.trouble or "the stream does not start"
         if now - sample.arrived_s > STALE_S:
             return self._stream.trouble or instrument.flaw or "no sample comes"
         jaws, reason = instrument.bird.closure, ""
@@ -138,70 +112,33 @@ class Minibird:
         if reason:
             return reason
         if sample is not instrument.used:
-            pose = self._place(instrument, sample)
+            turn = np.array(sample.quaternion)
+            if self._stream.inverse[sample.address]:
+                turn = quaternion_conjugate(turn)
+            pose = self._placer.world_from_tool(k, np.array(sample.position), turn, instrument.bird)
             if self._closure is not None and self._closure.has(tool) and instrument.used is not None:
                 way = np.linalg.norm(np.subtract(sample.position, instrument.used.position))
                 self._closure.moved(tool, float(way), now)
             self._position[k], self._quaternion[k] = pose.position, pose.quaternion
             instrument.used = sample
-            self._fresh.append(sample)
+            self._latency.used(sample.sent_s)
         self._jaws[k] = jaws
         return ""
 
-    def _place(self, instrument: _Instrument, sample: Sample) -> Rigid:
-        """world_from_tool = anchor · scene_from_device · (scale · position, rotation) · sensor_from_tool."""
-        bird = instrument.bird
-        turn = np.array(sample.quaternion)
-        if self._stream.inverse[bird.address]:
-            turn = quaternion_conjugate(turn)
-        position = field_distortion.correct(np.array([sample.position]), self._spec.distortion)[0]
-        device_from_sensor = Rigid(self._spec.scale * position, turn)
-        sensor_from_tool = Rigid(np.array(bird.position_mm), quaternion_from_euler_deg(bird.rotation_deg))
-        pose = self._scene_from_device @ device_from_sensor @ sensor_from_tool
-        if self._spec.anchor == "none":
-            return pose
-        if instrument.anchor is None:
-            instrument.anchor = self._home.world_from_tool(instrument.tool) @ pose.inverse()
-        return instrument.anchor @ pose
-
-    def _note(self, instrument: _Instrument, tick: int, reason: str) -> None:
-        """Keep account of when and why an instrument was lost."""
-        if reason and instrument.lost_tick is None:
-            instrument.lost_tick, instrument.reasons = tick, []
-        if reason:
-            # First nothing comes, then it turns out why.
-            if reason not in instrument.reasons and len(instrument.reasons) < MOST_REASONS:
-                instrument.reasons.append(reason)
-        elif instrument.lost_tick is not None:
-            self._lost_count += 1
-            if len(self._losses) < MOST_LOSSES:
-                self._losses.append(_loss(instrument, tick - instrument.lost_tick, self._tick_s))
-            instrument.lost_tick = None
-
     def tick(self, record: object) -> None:
         """The events of a tick are with the sinks: how long did its poses take to become them?"""
-        now = time.monotonic()
-        self._latency_ms.extend(1e3 * (now - sample.sent_s) for sample in self._fresh)
-        self._fresh.clear()
+        self._latency.told()
 
     def summary(self) -> dict[str, object]:
         """What was read, how late, and when and why it was not."""
-        still = [i for i in self._instruments if i.lost_tick is not None]
-        latency = np.array(self._latency_ms) if self._latency_ms else np.zeros(1)
         return {
             "driver": "minibird",
             "records": dict(sorted(self._stream.counts.items())),
             "measured_rate_hz": round(1.0 / self._line.period_s, 3),
             "jitter_ms": round(1e3 * self._line.jitter_s, 3),
-            "latency_ms": {
-                "poses": len(self._latency_ms),
-                "p50": round(float(np.percentile(latency, 50)), 3),
-                "p99": round(float(np.percentile(latency, 99)), 3),
-                "max": round(float(latency.max()), 3),
-            },
+            "latency_ms": self._latency.summary(),
             "restarts": self._stream.restarts,
-            "losses": self._lost_count + len(still),
-            "lost": self._losses + [_loss(i, self._ticks + 1 - (i.lost_tick or 0), self._tick_s) for i in still],
+            **self._losses.summary(),
             "closure": None if self._closure is None else self._closure.summary(),
         }
 
@@ -210,12 +147,3 @@ class Minibird:
         self._stream.close()
         if self._closure is not None:
             self._closure.close()
-
-
-def _loss(instrument: _Instrument, ticks: int, tick_s: float) -> dict[str, object]:
-    return {
-        "tool": instrument.bird.tool,
-        "tick": instrument.lost_tick,
-        "lost_s": round(ticks * tick_s, 3),
-        "reason": "; ".join(instrument.reasons),
-    }
