@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 from trainer import calibration, config
 from trainer.calibration import Calibration, Distortion
@@ -18,6 +18,7 @@ from trainer.config import ANGLE_DEG, POSITION_MM, Bounds, ConfigError
 from trainer.data_files import data_folder
 
 Vector = tuple[float, float, float]
+TCP_PORT = {"bounds": Bounds(1, 65535)}
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,10 @@ class Placement:
     rotation_deg: Vector = field(default=(0.0, 0.0, 0.0), metadata=ANGLE_DEG)  # about x, then y, then z
     anchor: Literal["home", "none"] = "none"  # home: the first sample of a tool is where the task has it wait
     distortion: Distortion | None = None  # of the tracker's field; usually from a calibration
+
+
+M = TypeVar("M", bound=Mount)
+P = TypeVar("P", bound=Placement)
 
 
 @dataclass(frozen=True)
@@ -143,21 +148,102 @@ class ClosureSpec:
 
 
 @dataclass(frozen=True)
+class Tracked(Mount):
+    """A sensor that its device knows by name, and the instrument that it moves."""
+
+    name: str
+    tool: Literal["left", "right"]
+
+
+@dataclass(frozen=True)
+class OpenigtlinkSpec(Placement):
+    """A server of OpenIGTLink (PLUS, 3D Slicer …) whose TRANSFORM messages move the instruments."""
+
+    device: tuple[Tracked, ...]  # by the device names in the messages
+    host: str = "127.0.0.1"
+    port: int = field(default=18944, metadata=TCP_PORT)
+
+    def __post_init__(self) -> None:
+        _check_tracked(self.device, "openigtlink.device")
+
+
+@dataclass(frozen=True)
+class NdiSpec(Placement):
+    """An NDI Polaris, Vega or Aurora."""
+
+    tracker: Literal["polaris", "vega", "aurora"]
+    sensor: tuple[Tracked, ...]  # an Aurora's in the order of its ports, the others' in that of their ROM files
+    port: str = ""  # serial, of a Polaris or an Aurora
+    host: str = ""  # of a Vega
+    tcp_port: int = field(default=8765, metadata=TCP_PORT)
+    rom: tuple[str, ...] = ()  # descriptions of the tools, beside the profile
+
+    def __post_init__(self) -> None:
+        _check_tracked(self.sensor, "ndi.sensor")
+        if bool(self.host) != (self.tracker == "vega") or bool(self.port) == (self.tracker == "vega"):
+            raise ValueError("a vega needs its 'host', a polaris or an aurora its serial 'port', and neither both")
+        if len(self.rom) != (0 if self.tracker == "aurora" else len(self.sensor)):
+            raise ValueError("'rom' names a file for each sensor of a polaris or vega, and none of an aurora's")
+
+
+@dataclass(frozen=True)
+class SpacemouseSpec:
+    """A SpaceMouse: the further its cap is pushed, the faster the instrument moves."""
+
+    tool: Literal["left", "right"]
+    device: str = ""  # as its library calls it; empty: the first that is found
+    rotation_deg: Vector = field(default=(0.0, 0.0, 0.0), metadata=ANGLE_DEG)  # scene_from_device; about x, then y, z
+    speed_mm_s: float = field(default=20.0, metadata={"bounds": Bounds(0.01, 1000.0)})  # at full push
+    turn_deg_s: float = field(default=60.0, metadata={"bounds": Bounds(0.1, 720.0)})  # at full twist
+    dead: float = field(default=0.05, metadata={"bounds": Bounds(0.0, 0.5)})  # of a full push, that counts as none
+    reach_mm: float = field(default=50.0, metadata={"bounds": Bounds(0.1, 1000.0)})  # from where the tool waits
+    closure: float = field(default=0.0, metadata={"bounds": Bounds(0.0, 1.0)})  # at the start
+    close_button: int = field(default=0, metadata={"bounds": Bounds(0, 63)})
+    open_button: int = field(default=1, metadata={"bounds": Bounds(0, 63)})
+    jaw_s: float = field(default=0.5, metadata={"bounds": Bounds(0.01, 10.0)})  # from open to closed, button held
+
+    def __post_init__(self) -> None:
+        if self.close_button == self.open_button:
+            raise ValueError("'close_button' and 'open_button' must differ")
+
+
+def _check_tracked(found: tuple[Tracked, ...], table: str) -> None:
+    """Raises ValueError where a tracker's sensors are none, or two of one name or for one tool."""
+    if not found:
+        raise ValueError(f"a tracker needs a table [[{table}]]")
+    for what in ("name", "tool"):
+        if len({getattr(tracked, what) for tracked in found}) < len(found):
+            raise ValueError(f"two tables [[{table}]] have the same {what}")
+
+
+@dataclass(frozen=True)
+class PublishSpec:
+    """Where the instruments' poses are told to others while they move, as TRANSFORM messages of OpenIGTLink."""
+
+    host: str = "127.0.0.1"  # this machine alone; "0.0.0.0": whoever reaches it
+    port: int = field(default=18944, metadata=TCP_PORT)
+
+
+@dataclass(frozen=True)
 class Profile:
     """A device, as its TOML file states it."""
 
     name: str
-    driver: Literal["scripted", "recording", "minibird"]
+    driver: Literal["scripted", "recording", "minibird", "openigtlink", "ndi", "spacemouse"]
     summary: str
     hand: Hand | None = None
     recording: RecordingSpec | None = None
     calibrated_by: str = "newest"  # of the calibrations beside the file; or the name of one of them, or "none"
     calibration: Calibration | None = None  # whose numbers are in effect
     minibird: MinibirdSpec | None = None
+    openigtlink: OpenigtlinkSpec | None = None
+    ndi: NdiSpec | None = None
+    spacemouse: SpacemouseSpec | None = None
     closure: ClosureSpec | None = None
+    publish: PublishSpec | None = None
 
     def __post_init__(self) -> None:
-        wanted = {"scripted": "hand", "recording": "recording", "minibird": "minibird"}[self.driver]
+        wanted = "hand" if self.driver == "scripted" else self.driver
         if getattr(self, wanted) is None:
             raise ValueError(f"driver '{self.driver}' needs a table [{wanted}]")
 
@@ -182,30 +268,40 @@ def parse_profile(text: str, name: str) -> Profile:
 
 def _calibrated(profile: Profile, name: str) -> Profile:
     """The profile with what was measured in the place of what it states itself."""
-    measured, spec = profile.calibration, profile.recording
-    if measured is not None and profile.minibird is not None:
-        return replace(profile, minibird=_calibrated_flock(profile.minibird, measured, name))
-    if measured is None or spec is None:
+    measured = profile.calibration
+    if measured is None:
         return profile
-    tips = {tip.sensor: tip.position_mm for tip in measured.tip}
-    for sensor in tips:
-        if sensor not in [s.name for s in spec.sensor]:
-            raise ConfigError(f"{name}: the calibration is of a sensor '{sensor}', which the profile does not have")
-    spec = replace(spec, sensor=tuple(replace(s, position_mm=tips.get(s.name, s.position_mm)) for s in spec.sensor))
-    if measured.scene is not None:
-        spec = replace(spec, position_mm=measured.scene.position_mm, rotation_deg=measured.scene.rotation_deg)
-    if measured.distortion is not None:
-        spec = replace(spec, distortion=measured.distortion)
-    return replace(profile, recording=spec)
+    if profile.minibird is not None:
+        birds = _calibrated_tips(
+            profile.minibird.bird, [f"bird{b.address}" for b in profile.minibird.bird], measured, name
+        )
+        return replace(profile, minibird=replace(_calibrated_place(profile.minibird, measured), bird=birds))
+    if profile.openigtlink is not None:
+        devices = profile.openigtlink.device
+        devices = _calibrated_tips(devices, [d.name for d in devices], measured, name)
+        return replace(profile, openigtlink=replace(_calibrated_place(profile.openigtlink, measured), device=devices))
+    if profile.ndi is not None:
+        tracked = _calibrated_tips(profile.ndi.sensor, [s.name for s in profile.ndi.sensor], measured, name)
+        return replace(profile, ndi=replace(_calibrated_place(profile.ndi, measured), sensor=tracked))
+    if profile.recording is not None:
+        sensors = _calibrated_tips(profile.recording.sensor, [s.name for s in profile.recording.sensor], measured, name)
+        return replace(profile, recording=replace(_calibrated_place(profile.recording, measured), sensor=sensors))
+    return profile
 
 
-def _calibrated_flock(spec: MinibirdSpec, measured: Calibration, name: str) -> MinibirdSpec:
-    """The flock's mapping as it was measured; its sensors are called ``bird1``, ``bird2`` …"""
+def _calibrated_tips(mounts: tuple[M, ...], names: list[str], measured: Calibration, file: str) -> tuple[M, ...]:
+    """Sensors, called ``names``, with the places of their tips as they were measured. Raises ConfigError."""
     tips = {tip.sensor: tip.position_mm for tip in measured.tip}
-    if unknown := set(tips).difference(f"bird{b.address}" for b in spec.bird):
-        raise ConfigError(f"{name}: the calibration is of a sensor '{min(unknown)}', which the profile does not have")
-    birds = tuple(replace(b, position_mm=tips.get(f"bird{b.address}", b.position_mm)) for b in spec.bird)
-    spec = replace(spec, bird=birds, distortion=measured.distortion or spec.distortion)
+    if unknown := set(tips).difference(names):
+        raise ConfigError(f"{file}: the calibration is of a sensor '{min(unknown)}', which the profile does not have")
+    return tuple(
+        replace(mount, position_mm=tips.get(name, mount.position_mm)) for name, mount in zip(names, mounts, strict=True)
+    )
+
+
+def _calibrated_place(spec: P, measured: Calibration) -> P:
+    """Where the device is, and how its field is bent, as it was measured."""
+    spec = replace(spec, distortion=measured.distortion or spec.distortion)
     if measured.scene is None:
         return spec
     return replace(spec, position_mm=measured.scene.position_mm, rotation_deg=measured.scene.rotation_deg)

@@ -91,6 +91,7 @@ def perform(
     from trainer.metrics.registry import check_targets, score
     from trainer.scene import build
     from trainer.session import interruptible, old_objects_left_alone, run
+    from trainer.sinks.igtlink import IgtlinkSink
     from trainer.sinks.log import LogSink
     from trainer.sinks.recording import RecordingSink
     from trainer.sinks.surface import Sink
@@ -113,6 +114,9 @@ def perform(
     if recording_path is not None:
         recording = RecordingSink(recording_path, header, scene.layout(), task.tick_hz, realtime=clock.realtime)
         sinks.append(stack.enter_context(closing(recording)))
+    if profile.profile.publish is not None:
+        published = profile.profile.publish
+        sinks.append(stack.enter_context(closing(IgtlinkSink(published.host, published.port, scene.tools))))
     log = stack.enter_context(closing(LogSink(log_path, header)))
     with closing(Progress(task)) as progress, interruptible() as interrupted, old_objects_left_alone():
         told = [driver] if isinstance(driver, LiveDriver) else []

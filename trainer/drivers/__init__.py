@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from trainer.config import ConfigError
@@ -57,8 +59,12 @@ def recording_path(file: ProfileFile) -> str:
     profile = file.profile
     if profile.recording is None or not profile.recording.path:
         raise ConfigError(f"device '{profile.name}' plays a recording: give its path to --device, or 'recording.path'")
-    beside = Path(file.path).parent if file.path.endswith(".toml") else Path()
-    return str(beside / profile.recording.path)
+    return str(_beside(file) / profile.recording.path)
+
+
+def _beside(file: ProfileFile) -> Path:
+    """The folder that a profile's relative paths begin at."""
+    return Path(file.path).parent if file.path.endswith(".toml") else Path()
 
 
 def open_driver(reference: str, task: Task, home: ToolPoses, seed: int) -> tuple[ProfileFile, Driver]:
@@ -80,6 +86,8 @@ def _driver(file: ProfileFile, profile: Profile, task: Task, home: ToolPoses, se
         from trainer.drivers.minibird import Minibird
 
         return Minibird(profile.minibird, profile.closure, tools, task.tick_hz, home)
+    if profile.driver in ("openigtlink", "ndi", "spacemouse"):
+        return _live(file, tools, task.tick_hz, home)
     path = recording_path(file)
     if is_logged(path):
         from trainer.drivers.logged import LoggedSession
@@ -90,3 +98,25 @@ def _driver(file: ProfileFile, profile: Profile, task: Task, home: ToolPoses, se
 
     assert profile.recording is not None
     return Recording(Path(path), profile.recording, tools, task.tick_hz, home)
+
+
+def _live(file: ProfileFile, tools: Sequence[str], tick_hz: float, home: ToolPoses) -> Driver:
+    """A device that tells finished poses."""
+    from trainer.drivers.live import LivePoses
+
+    profile = file.profile
+    session = (profile.closure, tools, tick_hz, home)
+    if profile.openigtlink is not None and profile.driver == "openigtlink":
+        from trainer.drivers.igtlink import Server
+
+        server = profile.openigtlink
+        return LivePoses("openigtlink", partial(Server, server), server, server.device, *session)
+    if profile.ndi is not None and profile.driver == "ndi":
+        from trainer.drivers.ndi import Tracker
+
+        tracker = profile.ndi
+        return LivePoses("ndi", partial(Tracker, tracker, _beside(file)), tracker, tracker.sensor, *session)
+    from trainer.drivers.spacemouse import open_spacemouse
+
+    assert profile.spacemouse is not None
+    return open_spacemouse(profile.spacemouse, *session)
