@@ -94,3 +94,80 @@ poses = 100
     assert [bird.position_mm for bird in spec.bird] == [(0.0, 0.0, 0.0), (0.0, 0.0, 42.0)]
     with pytest.raises(ConfigError, match="of a sensor 'bird7'"):
         profile.parse_profile(FLOCK + 'port = "p"\n' + BIRDS + measured.replace("bird2", "bird7"), "x.toml")
+
+
+def of(driver: str, table: str) -> str:
+    return f'name = "x"\ndriver = "{driver}"\nsummary = "x"\n[{driver}]\n{table}'
+
+
+def tracked(table: str, *named: tuple[str, str]) -> str:
+    return "".join(f'[[{table}]]\nname = "{name}"\ntool = "{tool}"\n' for name, tool in named)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (of("openigtlink", ""), r"\[openigtlink\]: missing key 'device'"),
+        (of("openigtlink", "device = []"), r"a tracker needs a table \[\[openigtlink\.device\]\]"),
+        (
+            of("openigtlink", tracked("openigtlink.device", ("A", "left"), ("A", "right"))),
+            r"two tables \[\[openigtlink\.device\]\] have the same name",
+        ),
+        (
+            of("openigtlink", tracked("openigtlink.device", ("A", "left"), ("B", "left"))),
+            r"two tables \[\[openigtlink\.device\]\] have the same tool",
+        ),
+        (
+            of("openigtlink", "port = 65536\n" + tracked("openigtlink.device", ("A", "left"))),
+            r"'openigtlink\.port' must be >= 1 and <= 65535, found 65536",
+        ),
+        (of("ndi", 'tracker = "aurora"\n' + tracked("ndi.sensor", ("A", "left"))), r"an aurora its serial 'port'"),
+        (
+            of("ndi", 'tracker = "vega"\nhost = "h"\nport = "p"\n' + tracked("ndi.sensor", ("A", "left"))),
+            r"a vega needs its 'host'",
+        ),
+        (
+            of("ndi", 'tracker = "polaris"\nport = "p"\n' + tracked("ndi.sensor", ("A", "left"))),
+            r"'rom' names a file for each sensor",
+        ),
+        (of("spacemouse", 'tool = "left"\nopen_button = 0'), r"'close_button' and 'open_button' must differ"),
+        (of("spacemouse", 'tool = "left"\nspeed_mm_s = 0'), r"'spacemouse\.speed_mm_s' must be >= 0\.01"),
+        (HAND + "[publish]\nport = 0", r"'publish\.port' must be >= 1"),
+        (HAND.replace("scripted", "ndi"), r"driver 'ndi' needs a table \[ndi\]"),
+    ],
+)
+def test_a_device_of_a_lab_that_cannot_be_is_refused_in_one_line(text: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=rf"^d\.toml: .*{message}") as caught:
+        profile.parse_profile(text, "d.toml")
+    assert "\n" not in str(caught.value)
+
+
+CALIBRATION = """
+[calibration]
+date = "2026-03-04T05:06:07+00:00"
+[calibration.scene]
+position_mm = [1, 2, 3]
+rotation_deg = [0, 0, 90]
+residual_mm = 0.1
+points = 4
+[[calibration.tip]]
+sensor = "A"
+position_mm = [0, 0, 42]
+residual_mm = 0.1
+uncertainty_mm = 0.1
+poses = 100
+"""
+
+
+@pytest.mark.parametrize("driver", ["openigtlink", "ndi"])
+def test_a_calibration_is_in_effect_for_a_lab_s_tracker(driver: str) -> None:
+    table = "ndi.sensor" if driver == "ndi" else "openigtlink.device"
+    head = 'tracker = "aurora"\nport = "p"\n' if driver == "ndi" else ""
+    found = profile.parse_profile(of(driver, head + tracked(table, ("A", "left"), ("B", "right"))) + CALIBRATION, "d")
+    spec = found.ndi or found.openigtlink
+    assert spec is not None
+    assert (spec.position_mm, spec.rotation_deg) == ((1.0, 2.0, 3.0), (0.0, 0.0, 90.0))
+    sensors = found.ndi.sensor if found.ndi is not None else spec.device  # type: ignore[union-attr]
+    assert [s.position_mm for s in sensors] == [(0.0, 0.0, 42.0), (0.0, 0.0, 0.0)]
+    with pytest.raises(ConfigError, match="the calibration is of a sensor 'A', which the profile does not have"):
+        profile.parse_profile(of(driver, head + tracked(table, ("B", "right"))) + CALIBRATION, "d")

@@ -49,7 +49,7 @@ class Mount:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Placement:
+class Registration:
     """How a device's poses enter the scene.
 
     world = anchor · scene_from_device · (scale · position, rotation) · sensor_from_tool.
@@ -63,7 +63,7 @@ class Placement:
 
 
 M = TypeVar("M", bound=Mount)
-P = TypeVar("P", bound=Placement)
+P = TypeVar("P", bound=Registration)
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Sensor(Mount):
 
 
 @dataclass(frozen=True)
-class RecordingSpec(Placement):
+class RecordingSpec(Registration):
     """How a recorded motion enters the scene."""
 
     path: str = ""  # usually given by --device PATH
@@ -100,7 +100,7 @@ class Bird(Mount):
 
 
 @dataclass(frozen=True)
-class MinibirdSpec(Placement):
+class MinibirdSpec(Registration):
     """A flock of miniBIRDs."""
 
     bird: tuple[Bird, ...]
@@ -156,7 +156,7 @@ class Tracked(Mount):
 
 
 @dataclass(frozen=True)
-class OpenigtlinkSpec(Placement):
+class OpenigtlinkSpec(Registration):
     """A server of OpenIGTLink (PLUS, 3D Slicer …) whose TRANSFORM messages move the instruments."""
 
     device: tuple[Tracked, ...]  # by the device names in the messages
@@ -168,7 +168,7 @@ class OpenigtlinkSpec(Placement):
 
 
 @dataclass(frozen=True)
-class NdiSpec(Placement):
+class NdiSpec(Registration):
     """An NDI Polaris, Vega or Aurora."""
 
     tracker: Literal["polaris", "vega", "aurora"]

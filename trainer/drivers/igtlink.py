@@ -31,8 +31,11 @@ class Server:
         self._parser = MessageParser()
         try:
             self._socket = socket.create_connection((spec.host, spec.port), CONNECT_S)
+            if self._socket.getsockname() == self._socket.getpeername():
+                self._socket.close()  # TCP connects a port of this machine that nobody serves to itself now and then
+                raise ConnectionRefusedError("Connection refused")
         except (OSError, UnicodeError) as error:
-            why = "does not answer" if isinstance(error, TimeoutError) else getattr(error, "strerror", None) or error
+            why = getattr(error, "strerror", None) or error
             raise DeviceError(f"{self._where}: {why}; start the OpenIGTLink server, or correct the profile") from None
         self._socket.settimeout(READ_S)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)

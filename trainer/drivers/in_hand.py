@@ -15,7 +15,7 @@ import numpy as np
 from trainer.drivers import field_distortion
 from trainer.geometry import Array, Rigid, quaternion_from_euler_deg
 from trainer.poses import ToolPoses
-from trainer.profile import Mount, Placement
+from trainer.profile import Mount, Registration
 
 #: A stream's first sample may take this long after the session began.
 FIRST_S = 0.5
@@ -53,7 +53,7 @@ class Pace:
 class Placer:
     """A sensor's poses, moved into the world as the profile says."""
 
-    def __init__(self, spec: Placement, home: ToolPoses) -> None:
+    def __init__(self, spec: Registration, home: ToolPoses) -> None:
         self._spec = spec
         self._home = home
         self._scene_from_device = Rigid(np.array(spec.position_mm), quaternion_from_euler_deg(spec.rotation_deg))

@@ -18,7 +18,7 @@ from trainer.drivers.in_hand import SWITCH_S, Latency, Losses, Pace, Placer
 from trainer.drivers.serial_port import DeviceError
 from trainer.geometry import Array
 from trainer.poses import ToolPoses
-from trainer.profile import ClosureSpec, Placement, Tracked
+from trainer.profile import ClosureSpec, Registration, Tracked
 
 #: A reading older than this no longer says where the hand is: five frames of a tracker of 20 Hz, assumed.
 STALE_S = 0.25
@@ -67,7 +67,7 @@ class LivePoses:
         self,
         name: str,
         connect: Callable[[], Connection],
-        placement: Placement,
+        registration: Registration,
         sensors: Sequence[Tracked],
         closure: ClosureSpec | None,
         tools: Sequence[str],
@@ -82,7 +82,7 @@ class LivePoses:
         self._position, self._quaternion = home.position.copy(), home.quaternion.copy()
         self._jaws = home.closure.copy()
         self._pace = Pace(tick_hz)
-        self._placer = Placer(placement, home)
+        self._placer = Placer(registration, home)
         self._latency = Latency()
         self._losses = Losses(self._pace.tick_s)
         self._counts: Counter[str] = Counter()

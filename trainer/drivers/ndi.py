@@ -59,14 +59,14 @@ class Tracker:
         self._heard_s = time.monotonic()
 
     def read(self) -> list[Reading]:
+        found = []
         with failures(self._where):
             _, _, frames, poses, _ = self._tracker.get_frame()
-        now = time.monotonic()
-        found = []
-        for k, name in enumerate(self._names):
-            if frames[k] != self._frames[k]:
-                self._frames[k] = float(frames[k])
-                found.append(_reading(name, now, np.asarray(poses[k], dtype=np.float64).ravel()))
+            now = time.monotonic()
+            for k, name in enumerate(self._names):
+                if frames[k] != self._frames[k]:
+                    self._frames[k] = float(frames[k])
+                    found.append(_reading(name, now, np.asarray(poses[k], dtype=np.float64).ravel()))
         if found:
             self._heard_s = now
         elif now - self._heard_s > SILENT_S:

@@ -27,7 +27,7 @@ from trainer.geometry import (
     quaternion_multiply,
 )
 from trainer.poses import ToolPoses
-from trainer.profile import ClosureSpec, Placement, SpacemouseSpec, Tracked
+from trainer.profile import ClosureSpec, Registration, SpacemouseSpec, Tracked
 
 AGAIN_S = 0.005  # between looks at the cap
 #: A longer time between two looks counts as this, s: a machine that slept must not fling the instrument. Assumed.
@@ -45,7 +45,7 @@ def open_spacemouse(
     moved = Tracked(name=spec.tool, tool=spec.tool)
     # The hand integrates in the world: nothing is left to place.
     connect = partial(Cap, spec, hand)
-    return LivePoses("spacemouse", connect, Placement(), [moved], closure, tools, tick_hz, home)
+    return LivePoses("spacemouse", connect, Registration(), [moved], closure, tools, tick_hz, home)
 
 
 class RateHand:
@@ -112,10 +112,10 @@ class Cap:
                 state = self._device.read()
                 if state.t == told:
                     break
-        now = time.monotonic()
-        push = np.array([state.x, state.y, state.z])
-        twist = np.array([state.roll, state.pitch, state.yaw])
-        self._hand.move(push, twist, state.buttons, now - self._looked_s)
+            now = time.monotonic()
+            push = np.array([state.x, state.y, state.z])
+            twist = np.array([state.roll, state.pitch, state.yaw])
+            self._hand.move(push, twist, state.buttons, now - self._looked_s)
         self._looked_s = now
         return [self._hand.reading(now)]
 

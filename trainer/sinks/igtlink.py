@@ -1,19 +1,23 @@
 """Poses of a running session for others to see: a server of OpenIGTLink that 3D Slicer or PLUS connects to.
 
 Each tick the newest pose of each instrument that is seen goes out as TRANSFORM ``LeftToWorld``, ``RightToWorld``, in mm
-of the world. A tick hands its bytes to a thread and goes on; whoever does not read fast enough gets fewer of them.
+of the world. A tick hands its poses to a thread and goes on; whoever does not read fast enough gets fewer of them.
 """
 
 from __future__ import annotations
 
+import os
 import socket
 import threading
 import time
 
 from trainer.openigtlink import Transform, encode
+from trainer.poses import ToolPoses
 from trainer.sinks.surface import TickRecord
 
 MOST_CLIENTS = 16
+#: Bytes that may wait in the kernel for a client, who else would be shown the past: some 150 messages, assumed.
+WAITING = 16384
 
 
 class PublishError(Exception):
@@ -28,24 +32,19 @@ class IgtlinkSink:
         try:
             self._listener = socket.create_server((host, port))
         except (OSError, OverflowError) as error:
-            why = getattr(error, "strerror", None) or error
+            why = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else error
             raise PublishError(f"{host}:{port}: {why}; give 'port' in [publish] one that is free") from None
         self._listener.setblocking(False)
         self.port: int = self._listener.getsockname()[1]
         self._clients: dict[socket.socket, bytes] = {}  # and what of its last message it did not take
-        self._newest = b""
+        self._newest: tuple[ToolPoses, float] | None = None
         self._fresh = threading.Event()
         self._stop = False
         self._thread = threading.Thread(target=self._serve, name="publish", daemon=True)
         self._thread.start()
 
     def tick(self, record: TickRecord) -> None:
-        now = time.time()
-        poses = record.poses
-        seen = [k for k in range(len(self._names)) if poses.valid[k]]
-        placed = [(self._names[k], poses.world_from_tool(k)) for k in seen]
-        transforms = [Transform(name, pose.position, pose.matrix, now) for name, pose in placed]
-        self._newest = b"".join(map(encode, transforms))
+        self._newest = (record.poses, time.time())
         self._fresh.set()
 
     def close(self) -> None:
@@ -60,12 +59,16 @@ class IgtlinkSink:
         while not self._stop:
             self._fresh.wait()
             self._fresh.clear()
-            data = self._newest
+            data = b"" if self._newest is None else self._messages(*self._newest)
             self._welcome()
             for client in list(self._clients):
                 if not self._sent(client, data):
                     client.close()
                     del self._clients[client]
+
+    def _messages(self, poses: ToolPoses, stamp_s: float) -> bytes:
+        placed = [(name, poses.world_from_tool(k)) for k, name in enumerate(self._names) if poses.valid[k]]
+        return b"".join(encode(Transform(name, pose.position, pose.matrix, stamp_s)) for name, pose in placed)
 
     def _welcome(self) -> None:
         try:
@@ -76,6 +79,7 @@ class IgtlinkSink:
             client.close()
             return
         client.setblocking(False)
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, WAITING)
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._clients[client] = b""
 
