@@ -102,21 +102,51 @@ class ThreadSpec:
 
 
 @dataclass(frozen=True)
+class TissueSpec:
+    """A structure of the anatomy that is free to move, and what it is made of (Gibson 1998, section 3.2)."""
+
+    structure: str
+    grown_to: tuple[str, ...]  # the structures that it is attached to
+    stretch: Sourced = field(metadata={"bounds": Bounds(1.0, 100.0)})  # the greatest length of a link, in rest lengths
+    compression: Sourced = field(metadata={"bounds": Bounds(0.0, 1.0, low_open=True)})  # the least length
+    shear: Sourced = field(metadata={"bounds": Bounds(0.0, 100.0)})  # how far a link's ends may be offset sideways
+    young_kPa: Sourced = field(metadata={"bounds": Bounds(1e-6, 1e9)})
+    shear_kPa: Sourced = field(metadata={"bounds": Bounds(1e-6, 1e9)})
+    time_constant_s: Sourced = field(metadata={"bounds": Bounds(1e-3, 1e3)})  # of elastic relaxation
+
+
+@dataclass(frozen=True)
+class AnatomySpec:
+    """A volume of labelled elements: named structures move, all others are rigid (Gibson 1998, section 3.1)."""
+
+    section: str  # name of a drawn section of one layer
+    tissue: tuple[TissueSpec, ...]
+
+    def __post_init__(self) -> None:
+        names = [t.structure for t in self.tissue]
+        if len(set(names)) != len(names):
+            raise ValueError("two entries of 'tissue' are of the same structure")
+
+
+@dataclass(frozen=True)
 class InstrumentSpec:
     """One instrument and where it waits before the exercise."""
 
     tool: Literal["left", "right"]
-    kind: Literal["forceps"]
+    kind: Literal["forceps", "grasper", "scissors"]
     home_mm: Vector = field(metadata=POSITION_MM)
     home_rotation_deg: Vector = field(metadata=ANGLE_DEG)  # about x, then y, then z of the scene
     reach_mm: float = field(metadata=LENGTH_MM)  # how far from the jaws' centre a thing can be to be caught
     grip_mN: Sourced = field(metadata=FORCE_MN)  # the most the fully closed jaws hold against a pull
     close_at: float = field(default=0.7, metadata={"bounds": Bounds(0.05, 1.0)})  # closure that grasps
     open_at: float = field(default=0.5, metadata={"bounds": Bounds(0.0, 0.95)})  # closure that lets go
+    tack_at: float | None = field(default=None, metadata={"bounds": Bounds(0.05, 1.0)})  # closure that tacks held tissue
 
     def __post_init__(self) -> None:
         if self.open_at >= self.close_at:
             raise ValueError("'open_at' must be less than 'close_at'")
+        if self.tack_at is not None and (self.kind != "grasper" or self.tack_at <= self.close_at):
+            raise ValueError("'tack_at' is for a grasper, and greater than 'close_at'")
 
 
 @dataclass(frozen=True)
@@ -127,6 +157,7 @@ class SceneSpec:
     vessel: tuple[VesselSpec, ...] = ()
     needle: NeedleSpec | None = None
     thread: ThreadSpec | None = None
+    anatomy: AnatomySpec | None = None
     position_mm: Vector = field(default=(0.0, 0.0, 0.0), metadata=POSITION_MM)
     rotation_deg: Vector = field(default=(0.0, 0.0, 0.0), metadata=ANGLE_DEG)  # about x, then y, then z
 
@@ -166,15 +197,27 @@ class Step:
     from the mark is for the metrics to say.
     ``withdraw``: needle and thread are out of every hole, and none tore. ``tail``: the thread left before its first
     hole is at most ``at_most_mm``. ``approximate``: the edges at the stitch are at most ``at_most_mm`` apart.
+
+    ``grasp``: an instrument holds ``structure``. ``pull``: what is held of it is at least ``at_least_mm`` from where it
+    rests. ``tack``: it is tacked, at least ``at_least_mm`` from where it rests. ``cut``: no path leads through it any
+    more between what it is grown to. ``retract``: the cut ends are at least ``at_least_mm`` apart. How far from
+    ``place_mm`` it was grasped or cut is for the metrics to say, too.
     """
 
     name: str
-    kind: Literal["drive", "withdraw", "tail", "approximate"]
+    kind: Literal["drive", "withdraw", "tail", "approximate", "grasp", "pull", "tack", "cut", "retract"]
     vessel: str = ""
     direction: Literal["in", "out"] = "in"
     clock_deg: float = field(default=0.0, metadata=ANGLE_DEG)  # the marked place
     bite_mm: float = field(default=0.0, metadata={"bounds": Bounds(0.0, 1000.0)})
     at_most_mm: float = field(default=0.0, metadata={"bounds": Bounds(0.0, 1000.0)})
+    structure: str = ""
+    at_least_mm: float = field(default=0.0, metadata={"bounds": Bounds(0.0, 1000.0)})
+    place_mm: Vector = field(default=(0.0, 0.0, 0.0), metadata=POSITION_MM)  # the marked place, of the scene at rest
+
+
+#: Kinds of steps that handle a structure of the anatomy.
+TISSUE_STEPS = ("grasp", "pull", "tack", "cut", "retract")
 
 
 @dataclass(frozen=True)
@@ -218,6 +261,10 @@ class Task:
                 raise ValueError(f"step '{s.name}' names no vessel of the scene: {s.vessel!r}")
             if s.kind == "drive" and s.bite_mm > vessels[s.vessel].length_mm:
                 raise ValueError(f"step '{s.name}': 'bite_mm' must not exceed the vessel's 'length_mm'")
+        movable = [t.structure for t in self.scene.anatomy.tissue] if self.scene.anatomy else []
+        for s in self.step:
+            if s.kind in TISSUE_STEPS and s.structure not in movable:
+                raise ValueError(f"step '{s.name}' names no movable structure of the scene: {s.structure!r}")
         if not self.step:
             raise ValueError("a task needs at least one 'step'")
 

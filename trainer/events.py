@@ -34,10 +34,10 @@ class Grasp(Event):
     """The jaws closed on something and hold it."""
 
     kind = "grasp"
-    target: str  # needle, thread or wall
-    body: str  # vessel, or ""
-    arc_mm: float  # along needle and thread from the needle's tip; 0 for a wall
-    point: Vector
+    target: str  # needle, thread, wall or tissue
+    body: str  # vessel or structure, or ""
+    arc_mm: float  # along needle and thread from the needle's tip; 0 for a wall and tissue
+    point: Vector  # of tissue in a volume: where it rests
     force_mN: float  # the pull that this grip resists
 
 
@@ -161,15 +161,46 @@ class Break(Event):
 
 @dataclass(frozen=True)
 class Tear(Event):
-    """A wall gave way: a hole pulled out, or grasped tissue ripped from the jaws."""
+    """A wall gave way: a hole pulled out, or grasped tissue ripped from the jaws. A volume: links beyond their limits."""
 
     kind = "tear"
-    body: str
-    wall: str
-    hole: int  # -1 where grasped tissue tore
+    body: str  # vessel or structure
+    wall: str  # "" in a volume
+    hole: int  # -1 where grasped tissue tore, and in a volume
     point: Vector
     force_mN: float
-    limit_mN: float
+    limit_mN: float  # 0 in a volume, which tears at a strain
+    volume_mm3: float = 0.0  # of the elements of a volume that lost a link
+
+
+@dataclass(frozen=True)
+class Cut(Event):
+    """Blades closed through a structure: one stroke, written when they stop closing."""
+
+    kind = "cut"
+    body: str
+    point: Vector  # the middle of what was cut, where it rests
+    volume_mm3: float  # of the elements that lost a link
+
+
+@dataclass(frozen=True)
+class Tack(Event):
+    """The jaws fixed what they hold where it is."""
+
+    kind = "tack"
+    body: str
+    point: Vector
+    volume_mm3: float  # of the elements that were fixed
+    force_mN: float  # pull of the tissue on them
+
+
+@dataclass(frozen=True)
+class Probe(Event):
+    """The tip of an instrument touched something rigid."""
+
+    kind = "probe"
+    body: str  # structure
+    point: Vector
 
 
 @dataclass(frozen=True)
@@ -246,14 +277,15 @@ class TaskDone(Event):
     thread_end: Vector
     thread_length_error: float  # largest relative error of a link's length
     tail_mm: float  # thread left before the first hole; 0 without a thread in a hole
-    gap_mm: float  # distance of the two ends' edges at the stitch; 0 without a stitch
+    gap_mm: float  # distance of the two ends' edges at the stitch, or of a structure's cut ends; 0 without either
+    pull_max_mN: float = 0.0  # the greatest pull of an instrument on tissue of a volume
 
 
 KINDS: dict[str, type[Event]] = {
     cls.kind: cls
     for cls in (
-        Grasp, Release, Slip, Drop, Contact, Pierce, Withdraw, PullThrough, Drape, Undrape, Break, Tear, Overforce,
-        TrackingLost, TrackingBack, TickOverrun, TaskStarted, StepDone, Aborted, TaskDone,
+        Grasp, Release, Slip, Drop, Contact, Pierce, Withdraw, PullThrough, Drape, Undrape, Break, Tear, Cut, Tack,
+        Probe, Overforce, TrackingLost, TrackingBack, TickOverrun, TaskStarted, StepDone, Aborted, TaskDone,
     )
 }  # fmt: skip
 

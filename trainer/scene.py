@@ -7,21 +7,34 @@ happened. A step is a function of task, tolerance, state and poses alone: it rea
 from __future__ import annotations
 
 import math
+from types import ModuleType
 
 import numpy as np
 
 from trainer.anatomy import vessel as vessels
+from trainer.anatomy.structures import structures
 from trainer.curriculum import Task
 from trainer.events import Aborted, Event, StepDone, TaskDone, TaskStarted, TrackingBack, TrackingLost
 from trainer.geometry import Array, Rigid, quaternion_from_axes, quaternion_from_euler_deg, slerp
-from trainer.instruments import forceps
+from trainer.instruments import arthroscopic, forceps
 from trainer.instruments.needle import Needle, needle_point, needle_tangent
-from trainer.interactions import drape, giving_way, goal, grasp, holding, pierce, seeing, thread_pull
+from trainer.interactions import (
+    drape,
+    giving_way,
+    goal,
+    grasp,
+    holding,
+    pierce,
+    region,
+    seeing,
+    thread_pull,
+    tissue_handling,
+)
 from trainer.interactions.world import Jaw, World
 from trainer.mechanics.equilibrium import Equilibrium
 from trainer.mechanics.thread import ThreadModel
 from trainer.poses import ToolPoses
-from trainer.sinks.surface import Frame, InstrumentPart, Layout, Surface
+from trainer.sinks.surface import Cloud, Frame, InstrumentPart, Layout, Surface
 from trainer.view import View
 
 #: A tick in which an instrument or the needle's tip moves further than this is taken in several movements, mm.
@@ -66,6 +79,8 @@ def build(task: Task, tolerance_mN: float = holding.TOLERANCE_MN) -> Scene:
         world.nodes = thread_pull.swage(world) + along[:, None] * back
         if spec.thread.drapes:
             drape.begin(world)
+    if spec.anatomy is not None:
+        world.region = region.build(spec.anatomy, len(spec.instrument))
     return Scene(world, tolerance_mN)
 
 
@@ -176,6 +191,7 @@ class Scene:
             jaw.pose = pose
         before = world.needle_pose
         tool = self._lead_needle()
+        tissue_handling.move(world, closures, start_s, span_s)
         grasp.close_and_open(world, closures, end_s)
         grasp.second_grips(world, end_s)
         if world.needle is not None and tool:
@@ -203,6 +219,9 @@ class Scene:
         if world.broken:
             self._end("failed", "the thread broke", time_s)
             return
+        if world.region is not None and world.region.torn_through:
+            self._end("failed", f"the {world.region.torn_through} tore through", time_s)
+            return
         while self.steps_done < len(task.step):
             step = task.step[self.steps_done]
             if not goal.reached(world, step, self._passes_used):
@@ -217,13 +236,14 @@ class Scene:
     def _end(self, outcome: str, reason: str, time_s: float) -> None:
         world = self.world
         self.outcome, self.reason = outcome, reason
+        tissue_handling.end_strokes(world, time_s)
         world.emit(
             TaskDone, time_s, "", outcome=outcome, reason=reason,
             needle_tip=world.place_in_world(world.needle_pose.position),
             needle_tangent=world.way_in_world(world.needle_pose.rotate(np.array([1.0, 0.0, 0.0]))),
             thread_end=world.place_in_world(world.nodes[-1]) if world.thread is not None else (0.0, 0.0, 0.0),
             thread_length_error=thread_pull.stretch(world), tail_mm=thread_pull.tail_mm(world),
-            gap_mm=goal.gap_mm(world),
+            gap_mm=goal.gap_mm(world), pull_max_mN=world.region.pull_max_mN if world.region is not None else 0.0,
         )  # fmt: skip
 
     def view(self) -> View:
@@ -234,7 +254,7 @@ class Scene:
         """What does not change during the exercise, for a recording."""
         world = self.world
         scene = world.task.scene
-        blades = forceps.parts()
+        blades = [_shape(i.kind).parts() for i in scene.instrument]
         return Layout(
             surfaces=tuple(
                 Surface(f"vessel/{v.spec.name}", v.display_triangles, (226, 120, 110, 205)) for v in self._vessels()
@@ -242,7 +262,7 @@ class Scene:
             parts=tuple(
                 InstrumentPart(f"{tool}/{blade.name}", i, blade.vertices, blade.triangles)
                 for i, tool in enumerate(self.tools)
-                for blade in blades
+                for blade in blades[i]
             ),
             needle=(
                 np.array([needle_point(world.needle, s) for s in np.linspace(0.0, world.needle.length, 33)])
@@ -251,12 +271,14 @@ class Scene:
             ),
             needle_radius_mm=0.5 * scene.needle.wire_mm if scene.needle else 0.0,
             thread_radius_mm=0.5 * scene.thread.diameter_mm.value if scene.thread else 0.0,
+            clouds=_clouds(world),
         )
 
     def frame(self) -> Frame:
         """A copy of everything that moves."""
         world, out = self.world, self.world.world_from_scene
-        parts = [forceps.part_poses(out @ j.pose, j.closure) for j in world.jaws]
+        kinds = [i.kind for i in world.task.scene.instrument]
+        parts = [_shape(k).part_poses(out @ j.pose, j.closure) for k, j in zip(kinds, world.jaws, strict=True)]
         needle = out @ world.needle_pose if world.needle is not None else None
         return Frame(
             vertices=tuple(
@@ -271,13 +293,44 @@ class Scene:
             thread=tuple(out.apply(piece) for piece in thread_pull.drawn(world)),
             force_mN=world.tissue_force_mN,
             tension_mN=world.tension_mN,
+            clouds=_moving_clouds(world),
         )
 
     def _vessels(self) -> tuple[vessels.Vessel, ...]:
         return self.world.tissue.vessels if self.world.tissue is not None else ()
 
 
+def _shape(kind: str) -> ModuleType:
+    """The module that says what an instrument looks like."""
+    return forceps if kind == "forceps" else arthroscopic
+
+
 def _part_way(a: Rigid, b: Rigid, share: float) -> Rigid:
     if share == 1.0:
         return b
     return Rigid(a.position + share * (b.position - a.position), slerp(a.quaternion, b.quaternion, share))
+
+
+def _clouds(world: World) -> tuple[Cloud, ...]:
+    """The structures of a region as a recording shows them."""
+    region = world.region
+    if region is None:
+        return ()
+    labels = region.volume.labels.reshape(-1)
+    radius = 0.5 * min(region.volume.spacing_mm)
+    found = []
+    for name, structure in structures().items():
+        elements = np.flatnonzero(labels == structure.number).astype(np.int32)
+        if len(elements):
+            fixed = None if name in region.elements else world.world_from_scene.apply(region.rest(elements))
+            found.append(Cloud(f"tissue/{name.replace(' ', '_')}", radius, (*structure.colour, 255), fixed))
+    return tuple(found)
+
+
+def _moving_clouds(world: World) -> tuple[Array, ...]:
+    """Where the elements of the structures are that are not fixed, in the order of :func:`_clouds`."""
+    region = world.region
+    if region is None:
+        return ()
+    moving = [region.elements[name] for name in structures() if name in region.elements]
+    return tuple(world.world_from_scene.apply(region.places(elements)) for elements in moving)

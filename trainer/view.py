@@ -70,3 +70,12 @@ class View(ABC):
     @abstractmethod
     def gap_mm(self) -> float:
         """Between the edges at the stitch."""
+
+    @abstractmethod
+    def tissue(self, structure: str, place_mm: Array) -> Array:
+        """Where the element of a structure is (3,) mm that is nearest to ``place_mm`` of the scene at rest."""
+
+    @property
+    @abstractmethod
+    def tissue_holders(self) -> tuple[int, ...]:
+        """The instruments that hold tissue of a volume."""

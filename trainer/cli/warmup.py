@@ -41,7 +41,7 @@ def warm_up(task: Task) -> None:
     from dataclasses import replace
 
     from trainer.clock import Fast
-    from trainer.drivers.scripted import ScriptedHands
+    from trainer.drivers import scripted_hands
     from trainer.profile import Hand
     from trainer.scene import build
     from trainer.session import run
@@ -49,4 +49,4 @@ def warm_up(task: Task) -> None:
     vessels = tuple(replace(vessel, layers=9, around=8) for vessel in task.scene.vessel)
     coarse = replace(task, scene=replace(task.scene, vessel=vessels), tick_hz=20.0)
     scene = build(coarse)
-    run(scene, ScriptedHands(Hand(speed_mm_s=30.0), coarse, scene.home, seed=0), [], Fast(coarse.tick_hz))
+    run(scene, scripted_hands(Hand(speed_mm_s=30.0), coarse, scene.home, seed=0), [], Fast(coarse.tick_hz))

@@ -11,9 +11,9 @@ from trainer.config import ConfigError
 from trainer.curriculum import Task
 from trainer.drivers.driver import Driver
 from trainer.poses import ToolPoses
-from trainer.profile import Profile, ProfileFile, load_profile, parse_profile
+from trainer.profile import Hand, Profile, ProfileFile, load_profile, parse_profile
 
-__all__ = ["Driver", "is_logged", "is_recording", "open_driver", "open_profile", "recording_path"]
+__all__ = ["Driver", "is_logged", "is_recording", "open_driver", "open_profile", "recording_path", "scripted_hands"]
 
 
 #: By the end of a recording's name: the shipped profile that plays it; None where sensors have no usual names.
@@ -76,11 +76,20 @@ def open_driver(reference: str, task: Task, home: ToolPoses, seed: int) -> tuple
     return file, _driver(file, file.profile, task, home, seed)
 
 
+def scripted_hands(hand: Hand, task: Task, home: ToolPoses, seed: int) -> Driver:
+    """The scripted hands that know what a task asks for: sewing, or handling a region of the anatomy."""
+    if task.scene.anatomy is not None:
+        from trainer.drivers.arthroscopic import ArthroscopicHands
+
+        return ArthroscopicHands(hand, task, home, seed)
+    from trainer.drivers.scripted import ScriptedHands
+
+    return ScriptedHands(hand, task, home, seed)
+
+
 def _driver(file: ProfileFile, profile: Profile, task: Task, home: ToolPoses, seed: int) -> Driver:
     if profile.hand is not None and profile.driver == "scripted":
-        from trainer.drivers.scripted import ScriptedHands
-
-        return ScriptedHands(profile.hand, task, home, seed)
+        return scripted_hands(profile.hand, task, home, seed)
     tools = [instrument.tool for instrument in task.scene.instrument]
     if profile.minibird is not None and profile.driver == "minibird":
         from trainer.drivers.minibird import Minibird

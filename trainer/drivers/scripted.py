@@ -1,27 +1,24 @@
-"""Scripted hands: they look at the scene as a person does and move two instruments through a task.
+"""Scripted hands that sew: they see where needle, walls, holes and thread are at this tick, and stitch.
 
-The hands know nothing that a trainee could not see: where needle, walls, holes and thread are at this tick.
-What they intend (angle, bite, clock) comes from the profile, or from the task's marks; how well they do it
-(tremor, aim, pauses, detours) comes from the profile alone.
+What they intend (angle, bite, clock) comes from the profile, or from the task's marks.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 
 from trainer.curriculum import Step, Task
-from trainer.drivers.hand_motion import Tremor, along_arc, between, ease, needle_pose, round_vessel, turn_angle
+from trainer.drivers.hand_motion import along_arc, between, ease, needle_pose, round_vessel
+from trainer.drivers.hands import TURN, Hands, Movement
 from trainer.drivers.sight import Lost, Sight, steepest_from_lumen
 from trainer.geometry import Array, Rigid, quaternion_from_axes, slerp, unit
 from trainer.poses import ToolPoses
 from trainer.profile import Hand
 from trainer.view import View
-
-Movement = Iterator[None]  # yields once per tick
 
 PRESS = 0.25  # speed while the needle goes through a wall, as a share of the hand's speed
 AIMED_MM = 0.03  # this near to the place aimed at the tip goes straight on
@@ -33,54 +30,20 @@ BITE_DEPTH_MM = 2.0  # arc beyond a hole at which the other hand takes over
 MOST_REAR_MM = 2.0  # so much further the needle is drawn at most until its rear end is out of the vessel
 TAKE_AT_MM = 0.6  # distance from the tip at which the other hand takes the needle
 TRIES = 5  # at catching needle or thread
-JAW_S = 0.15  # time to open or close the jaws
-TURN = 2.0  # fastest turn of an instrument, rad/s (assumed)
 
 
-class ScriptedHands:
-    """A driver whose poses come from a plan; see :class:`trainer.profile.Hand` for its settings."""
+class ScriptedHands(Hands):
+    """The hands of a surgeon with needle and thread."""
 
     def __init__(self, hand: Hand, task: Task, home: ToolPoses, seed: int) -> None:
-        self._hand = hand
-        self._task = task
-        self._dt = 1.0 / task.tick_hz
-        self._rng = np.random.default_rng([hand.seed, seed])
-        count = len(home.closure)
-        self._tremor = [Tremor(1e-3 * hand.tremor_rms_um, hand.tremor_hz, self._dt, self._rng) for _ in range(count)]
-        self._pose = [home.world_from_tool(i) for i in range(count)]  # intended, without tremor
-        self._closure = home.closure.copy()
-        self._plan: Movement | None = None
+        super().__init__(hand, task, home, seed)
         self._see: Sight
-        self._stopped = ""
         needle = task.scene.needle
         self._needle_length = needle.length_mm if needle else 0.0
         self._radius = needle.length_mm / math.radians(needle.arc_deg) if needle else 1.0
 
-    def poll(self, tick: int, view: object) -> ToolPoses | None:
-        assert isinstance(view, View)
-        if self._plan is None:
-            self._see = Sight(self._task, view, self._needle_length, self._radius)
-            self._plan = self._perform()
-        self._see.view = view
-        try:
-            next(self._plan)
-        except StopIteration:
-            return None
-        except Lost as reason:
-            self._stopped = str(reason)
-            return None
-        return ToolPoses(
-            position=np.array([p.position + t.next() for p, t in zip(self._pose, self._tremor, strict=True)]),
-            quaternion=np.array([p.quaternion for p in self._pose]),
-            closure=self._closure.copy(),
-            valid=np.ones(len(self._pose), dtype=bool),
-        )
-
-    def summary(self) -> dict[str, object]:
-        return {"driver": "scripted", "stopped": self._stopped}
-
-    def close(self) -> None:
-        self._plan = None
+    def _look(self, view: View) -> None:
+        self._see = Sight(self._task, view, self._needle_length, self._radius)
 
     # --- the plan ------------------------------------------------------------------------------------------------
 
@@ -312,15 +275,6 @@ class ScriptedHands:
         inward = s * matrix[:, 0] + c * matrix[:, 1]
         return Rigid(point, quaternion_from_axes(inward, matrix[:, 2]))
 
-    def _glide(self, tool: int, target: Rigid, pace: float = 1.0) -> Movement:
-        """An instrument that carries nothing moves straight to ``target``."""
-        start = self._pose[tool]
-        bump = self._detour()
-        for u in self._paced(start, target, pace, 2.0 * float(np.linalg.norm(bump))):
-            pose = between(start, target, u)
-            self._pose[tool] = Rigid(pose.position + math.sin(math.pi * u) ** 2 * bump, pose.quaternion)
-            yield
-
     def _carry(self, tool: int, target: Rigid, offset: Rigid) -> Movement:
         """The needle, held by ``tool``, moves straight to ``target``."""
         yield from self._glide(tool, target @ offset)
@@ -369,35 +323,6 @@ class ScriptedHands:
             distance = first + ease(k / ticks) * (last - first)
             self._pose[tool] = along_arc(pose, distance, self._radius) @ offset
             yield
-
-    def _paced(self, start: Rigid, target: Rigid, pace: float, detour_mm: float) -> Iterator[float]:
-        way = float(np.linalg.norm(target.position - start.position)) + detour_mm
-        seconds = max(
-            way / (pace * self._hand.speed_mm_s),
-            turn_angle(start, target) / TURN,
-        )
-        ticks = max(1, math.ceil(seconds / self._dt))
-        for k in range(1, ticks + 1):
-            yield ease(k / ticks)
-
-    def _jaws(self, tool: int, closure: float) -> Movement:
-        start = float(self._closure[tool])
-        ticks = max(1, round(JAW_S / self._dt))
-        for k in range(1, ticks + 1):
-            self._closure[tool] = start + (closure - start) * k / ticks
-            yield
-        yield
-
-    def _wait(self, seconds: float) -> Movement:
-        for _ in range(math.ceil(seconds / self._dt)):
-            yield
-
-    def _hesitate(self) -> Movement:
-        if self._hand.hesitation_s > 0.0:
-            yield from self._wait(self._rng.exponential(self._hand.hesitation_s))
-
-    def _detour(self) -> Array:
-        return self._rng.normal(0.0, 1.0, 3) * self._hand.wander_mm
 
     def _press_step(self) -> float:
         return PRESS * self._hand.speed_mm_s * self._dt

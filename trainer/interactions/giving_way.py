@@ -159,15 +159,16 @@ def _judge_jaw(world: World, tool: int, load: float, time_s: float) -> None:
 
 def _limits(world: World, time_s: float) -> None:
     """Report the task's limits that are exceeded, once for each excursion."""
-    _check(world, "tissue_pull", world.tissue_force_mN, "", "", time_s)
+    check_limit(world, "tissue_pull", world.tissue_force_mN, "", "", time_s)
     for i, jaw in enumerate(world.jaws):
         pressure, body = 0.0, ""
         if jaw.target == "wall" and world.tissue is not None:
             pressure, body = grasp.pressure_kPa(world, i), world.tissue.vessels[jaw.vessel].spec.name
-        _check(world, "grasp_pressure", pressure, world.tools[i], body, time_s)
+        check_limit(world, "grasp_pressure", pressure, world.tools[i], body, time_s)
 
 
-def _check(world: World, name: str, value: float, tool: str, body: str, time_s: float) -> None:
+def check_limit(world: World, name: str, value: float, tool: str, body: str, time_s: float) -> None:
+    """Report that ``value`` exceeds the task's limit ``name``, once for each excursion."""
     limit = world.task.limits.get(name)
     if limit is None:
         return

@@ -7,13 +7,16 @@ import math
 import numpy as np
 
 from trainer.anatomy.vessel import wall_point
-from trainer.curriculum import Step
+from trainer.curriculum import TISSUE_STEPS, Step
+from trainer.interactions.region import Region
 from trainer.interactions.thread_pull import tail_mm
 from trainer.interactions.world import Hole, World
 
 
 def reached(world: World, step: Step, used: set[int]) -> bool:
     """Whether ``step`` is reached now; a pass of the needle counts for one step only and is put into ``used``."""
+    if step.kind in TISSUE_STEPS:
+        return world.region is not None and _handled(world.region, step)
     if step.kind == "drive":
         passes = _driven(world, step) - used
         used |= passes
@@ -27,8 +30,28 @@ def reached(world: World, step: Step, used: set[int]) -> bool:
     return bool(threaded) and 0.0 < gap_mm(world) <= step.at_most_mm
 
 
+def _handled(region: Region, step: Step) -> bool:
+    """Whether the step's structure is held, displaced, tacked, severed or drawn apart as the step asks."""
+    holds = [h.elements for h in region.held if h is not None and h.structure == step.structure]
+    match step.kind:
+        case "grasp":
+            return bool(holds)
+        case "pull":
+            return any(region.displaced_mm(elements) >= step.at_least_mm for elements in holds)
+        case "tack":
+            elements = region.elements[step.structure]
+            tacked = elements[region.tacked[elements]]
+            return len(tacked) > 0 and region.displaced_mm(tacked) >= step.at_least_mm
+        case "cut":
+            return step.structure in region.severed and not any(region.strokes)
+        case _:
+            return region.parted_mm(step.structure) >= step.at_least_mm
+
+
 def gap_mm(world: World) -> float:
-    """Distance of the cut edges of two vessels at the stitch that joins them; 0 without a stitch."""
+    """Distance of the cut edges of two vessels at the stitch that joins them, or of a structure's; 0 without either."""
+    if world.region is not None:
+        return max(map(world.region.parted_mm, world.region.severed), default=0.0)
     if world.tissue is None or world.solver is None:
         return 0.0
     outer: dict[int, Hole] = {h.place.vessel: h for h in world.open_holes() if h.place.wall == "outer"}

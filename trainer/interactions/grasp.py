@@ -30,6 +30,8 @@ def close_and_open(world: World, closures: Array, time_s: float) -> None:
     """
     for i, (jaw, spec) in enumerate(zip(world.jaws, world.task.scene.instrument, strict=True)):
         before, jaw.closure = jaw.closure, float(closures[i])
+        if spec.kind != "forceps":  # a region's rules are tissue_handling's
+            continue
         if jaw.target:
             if jaw.closure < spec.open_at or (jaw.target == "wall" and pressure_kPa(world, i) == 0.0):
                 target, body = jaw.target, _body(world, jaw)

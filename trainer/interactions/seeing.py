@@ -82,6 +82,17 @@ class SceneView(View):
     def gap_mm(self) -> float:
         return goal.gap_mm(self._world)
 
+    def tissue(self, structure: str, place_mm: Array) -> Array:
+        world = self._world
+        assert world.region is not None
+        elements = world.region.elements[structure]
+        away = np.linalg.norm(world.region.rest(elements) - place_mm, axis=1)
+        return world.world_from_scene.apply(world.region.places(elements[[np.argmin(away)]])[0])
+
+    @cached_property
+    def tissue_holders(self) -> tuple[int, ...]:
+        return tuple(i for i, j in enumerate(self._world.jaws) if j.target == "tissue")
+
 
 def poses(world: World) -> ToolPoses:
     """Where the instruments are, in the world."""

@@ -18,6 +18,7 @@ from trainer.curriculum import Task
 from trainer.events import Event
 from trainer.geometry import Array, Rigid, fit_rotation
 from trainer.instruments.needle import Needle
+from trainer.interactions.region import Region
 from trainer.mechanics.equilibrium import Equilibrium
 from trainer.mechanics.quasi_newton import at_points
 from trainer.mechanics.thread import ThreadModel
@@ -76,7 +77,7 @@ class Jaw:
     closure: float
     seen: bool = True
     lost_at: float = 0.0  # time at which the device last lost the instrument
-    target: str = ""  # needle, thread, wall, or nothing
+    target: str = ""  # needle, thread, wall, tissue, or nothing
     since: int = 0  # order of grasping; who holds the needle longest leads it
     arc: float = 0.0  # along needle and thread from the tip
     lag_mm: float = 0.0  # thread that the tissue's equilibrium has yet to give to this grip
@@ -120,6 +121,7 @@ class World:
     thread: ThreadModel | None = None
     nodes: Array = field(default_factory=lambda: np.zeros((0, 3)))  # of the thread
     pieces: Array = field(default_factory=lambda: np.zeros((0, 2)))  # of the thread
+    region: Region | None = None
     contact: TipContact | None = None
     touched: dict[tuple[int, str], float] = field(default_factory=dict)  # (vessel, wall) → time of the tip's last touch
     holes: list[Hole] = field(default_factory=list)

@@ -221,6 +221,8 @@ def _plane(volume: Volume, u: Singles, i: int) -> Singles:
 def _seam_ways(volume: Volume, state: VolumeState, rest: Array, part: Array, whole: Array) -> Array:
     """How far seams move their ends (s, 2, 3) mm in a sweep: each is a linear link of its ends' materials."""
     seams = state.seams
+    if not len(seams.ends):
+        return np.zeros((0, 2, 3))
     labels = volume.labels.reshape(-1)
     stretched = (state.u[:, seams.ends[:, 1]] - state.u[:, seams.ends[:, 0]]).T - seams.rest
     ways = np.zeros((len(seams.ends), 2, 3))

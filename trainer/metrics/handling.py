@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from trainer.curriculum import Task
-from trainer.events import Break, Contact, Drop, Event, Grasp, Overforce, Pierce, Slip, Tear
+from trainer.events import Break, Contact, Cut, Drop, Event, Grasp, Overforce, Pierce, Slip, Tear
 from trainer.metrics.performance import Performance
 from trainer.metrics.registry import metric, pierces
 
@@ -28,7 +28,7 @@ def _count(performance: Performance, kind: type[Event]) -> float:
 
 @metric("grasp_count", "count")
 def grasps(performance: Performance, _: str) -> float:
-    """How often the jaws took hold of needle, thread or wall."""
+    """How often the jaws took hold of needle, thread, wall or tissue."""
     return _count(performance, Grasp)
 
 
@@ -39,14 +39,16 @@ def wall_grasps(performance: Performance, _: str) -> float:
 
 
 def _touched(event: Event) -> bool:
-    return isinstance(event, Contact | Pierce | Overforce) or (isinstance(event, Grasp) and event.target == "wall")
+    if isinstance(event, Grasp):
+        return event.target in ("wall", "tissue")
+    return isinstance(event, Contact | Pierce | Overforce | Cut)
 
 
 @metric("overforce_count", "count", better="lower", version="2")
 def overforces(performance: Performance, _: str) -> float | None:
     """How often a force or pressure rose above the task's limits; once per excursion.
 
-    None where neither needle nor jaws touched a wall: no touch is not a gentle one.
+    None where neither needle nor jaws touched a wall or tissue: no touch is not a gentle one.
     """
     return _count(performance, Overforce) if any(map(_touched, performance.record.events)) else None
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from trainer.events import Grasp, Pierce, PullThrough, Release, StepDone, Withdraw
+from trainer.events import Cut, Grasp, Pierce, PullThrough, Release, StepDone, Tack, Withdraw
 from trainer.metrics.performance import Performance
 from trainer.metrics.registry import metric
 from trainer.metrics.track import FILTER
@@ -19,7 +19,7 @@ IDLE_S = 0.5
 MOVE_ON_MM_S, MOVE_OFF_MM_S, MOVE_S = 2.0, 1.0, 0.2
 
 #: Events that an instrument's way leads to.
-AIMS = (Grasp, Release, Pierce, Withdraw, PullThrough)
+AIMS = (Grasp, Release, Pierce, Withdraw, PullThrough, Cut, Tack)
 
 
 def runs(flags: NDArray[np.bool_]) -> NDArray[np.intp]:
@@ -55,8 +55,8 @@ def path_length(performance: Performance, tool: str) -> float | None:
 def economy(performance: Performance, tool: str) -> float | None:
     """Straight lines between the places where the instrument did something, over its way between them; 1 is direct.
 
-    The places are where the instrument was at its grasps, releases, piercings and withdrawals, from the
-    first to the last. Straight lines from target to target, not from start to finish: a task that ends
+    The places are where the instrument was at its grasps, releases, piercings, withdrawals, cuts and tacks, from
+    the first to the last. Straight lines from target to target, not from start to finish: a task that ends
     where it began would score 0 however well it was done.
     """
     track = performance.tracks.get(tool)

@@ -9,16 +9,19 @@ from datetime import datetime
 from trainer.events import (
     Break,
     Contact,
+    Cut,
     Drape,
     Drop,
     Event,
     Grasp,
     Overforce,
     Pierce,
+    Probe,
     PullThrough,
     Release,
     Slip,
     StepDone,
+    Tack,
     TaskDone,
     TaskStarted,
     Tear,
@@ -33,12 +36,12 @@ from trainer.events import (
 DISCLAIMER = "Training feedback, not a certificate."
 
 #: Units that are no part of a reader's language.
-_UNIT_WORDS = {"deg": "°", "count": "", "ratio": ""}
+_UNIT_WORDS = {"deg": "°", "count": "", "ratio": "", "mm3": "mm³"}
 
 
 def title(metric: str) -> str:
     """A metric's name for a reader: without its unit and with spaces."""
-    for suffix in ("_deg", "_mm", "_s", "_mN"):
+    for suffix in ("_deg", "_mm", "_mm3", "_s", "_mN"):
         metric = metric.removesuffix(suffix)
     words = metric.replace("_", " ")
     return words[:1].upper() + words[1:]
@@ -52,7 +55,7 @@ def number(value: float | None, unit: str = "") -> str:
     """A value with as many digits as its unit deserves; a dash for None."""
     if value is None:
         return "–"
-    digits = {"deg": 1, "mm": 2, "s": 1, "mN": 1, "count": 0, "ratio": 2}.get(unit, 2)
+    digits = {"deg": 1, "mm": 2, "mm3": 0, "s": 1, "mN": 1, "count": 0, "ratio": 2}.get(unit, 2)
     if unit == "mm" and abs(value) >= 100.0:
         digits = 0
     text = f"{value:.{digits}f}"
@@ -145,6 +148,14 @@ def describe(event: Event) -> str:
             return f"thread off {_lain_over(event.over, event.body)} after {event.lay_s:.1f} s"
         case Break():
             return f"thread at {event.tension_mN:.0f} mN"
+        case Tear() if not event.wall:
+            return f"{event.body}, {event.volume_mm3:.0f} mm³"
+        case Cut():
+            return f"{event.body}, {event.volume_mm3:.0f} mm³"
+        case Tack():
+            return f"{event.body}, {event.volume_mm3:.0f} mm³ at {event.force_mN:.0f} mN"
+        case Probe():
+            return event.body
         case Tear():
             return f"{event.wall} wall of {event.body} at {event.force_mN:.0f} mN"
         case Overforce():

@@ -36,6 +36,16 @@ class InstrumentPart:
 
 
 @dataclass(frozen=True)
+class Cloud:
+    """Elements of a volume, shown as a ball each."""
+
+    name: str  # e.g. tissue/femur
+    radius_mm: float
+    rgba: tuple[int, int, int, int]
+    fixed: Array | None  # (n, 3) mm, world, of what does not move; None where a frame tells
+
+
+@dataclass(frozen=True)
 class Layout:
     """What a recording needs to know before the first frame."""
 
@@ -44,6 +54,7 @@ class Layout:
     needle: Array | None  # (m, 3) mm centre line in the needle's own frame, tip first
     needle_radius_mm: float
     thread_radius_mm: float
+    clouds: tuple[Cloud, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -58,6 +69,7 @@ class Frame:
     thread: tuple[Array, ...]  # pieces of the thread, each (n, 3) mm; empty without thread
     force_mN: float  # largest force between instruments and tissue
     tension_mN: float  # thread
+    clouds: tuple[Array, ...] = ()  # per cloud that is not fixed, (n, 3) mm, world
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,124 @@
+"""Scripted hands of an arthroscopy: they grasp a structure at its mark, pull, tack it and cut it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from trainer.curriculum import Step, Task
+from trainer.drivers.hands import Hands, Movement
+from trainer.drivers.sight import Lost
+from trainer.geometry import Array, Rigid
+from trainer.poses import ToolPoses
+from trainer.profile import Hand
+from trainer.view import View
+
+#: A profile tells how a hand moves under the microscope. In a joint its speed, aim and detours are larger by this
+#: (assumed: a ligament is ten times as wide as a vessel), its tremor is not.
+LARGER = 5.0
+STAND_OFF_MM = 12.0  # an instrument's distance before it reaches for something
+FIRM = 0.9  # closure that holds
+PULL_PACE = 0.15  # speed of a pull, as a share of the hand's
+PULL_BEYOND = 1.15  # a pull goes so much further than the step asks: tissue gives way in the jaws
+SNIP_MM = 4.0  # how far scissors go on after each snip
+TRIES = 5  # at catching tissue
+MOST_SNIPS = 8
+WATCH_S = 2.0  # how long the hand looks whether cut ends draw apart
+
+
+class ArthroscopicHands(Hands):
+    """The hands of a surgeon with grasper and scissors."""
+
+    def __init__(self, hand: Hand, task: Task, home: ToolPoses, seed: int) -> None:
+        larger = replace(
+            hand,
+            speed_mm_s=LARGER * hand.speed_mm_s,
+            aim_error_mm=LARGER * hand.aim_error_mm,
+            wander_mm=LARGER * hand.wander_mm,
+        )
+        super().__init__(larger, task, home, seed)
+        self._view: View
+        self._home = [home.world_from_tool(i) for i in range(len(home.closure))]
+        kinds = [i.kind for i in task.scene.instrument]
+        self._grasper = kinds.index("grasper")
+        self._scissors = kinds.index("scissors") if "scissors" in kinds else -1
+
+    def _look(self, view: View) -> None:
+        self._view = view
+
+    def _perform(self) -> Movement:
+        for step in self._task.step:
+            yield from self._hesitate()
+            if step.kind == "grasp":
+                yield from self._take(step)
+            elif step.kind == "pull":
+                yield from self._pull(step)
+            elif step.kind == "tack":
+                yield from self._tack()
+            elif step.kind == "cut":
+                yield from self._cut(step)
+            else:
+                yield from self._wait(WATCH_S)
+        yield from self._wait(0.5)
+
+    def _take(self, step: Step) -> Movement:
+        for _ in range(TRIES):
+            yield from self._jaws(self._grasper, 0.0)
+            place = self._view.tissue(step.structure, np.array(step.place_mm)) + self._miss()
+            yield from self._reach(self._grasper, place)
+            yield from self._jaws(self._grasper, FIRM)
+            if self._grasper in self._view.tissue_holders:
+                return
+        raise Lost("the jaws do not catch the tissue")
+
+    def _pull(self, step: Step) -> Movement:
+        here = self._pose[self._grasper]
+        way = np.array(step.place_mm) - here.position
+        size = float(np.linalg.norm(way))
+        far = max(size, PULL_BEYOND * step.at_least_mm)
+        target = Rigid(here.position + way / size * far + self._miss(), here.quaternion)
+        yield from self._glide(self._grasper, target, PULL_PACE)
+        if self._grasper not in self._view.tissue_holders:
+            raise Lost("the tissue slid out of the jaws")
+
+    def _tack(self) -> Movement:
+        yield from self._jaws(self._grasper, 1.0)
+        yield from self._jaws(self._grasper, 0.0)
+        yield from self._back(self._grasper)
+
+    def _cut(self, step: Step) -> Movement:
+        """Snip across the structure at its mark, a little further each time, until it is severed."""
+        tool, done = self._scissors, self._view.steps_done
+        mark = self._view.tissue(step.structure, np.array(step.place_mm)) + self._miss()
+        ahead = self._home[tool].matrix[:, 0]
+        start = mark - SNIP_MM * ahead
+        yield from self._reach(tool, start)
+        for snip in range(MOST_SNIPS):
+            yield from self._jaws(tool, 1.0)
+            if self._view.steps_done > done:
+                break
+            yield from self._jaws(tool, 0.0)
+            onwards = start + (snip + 1) * SNIP_MM * ahead
+            yield from self._glide(tool, Rigid(onwards, self._pose[tool].quaternion), 0.5)
+        else:
+            raise Lost("the tissue is not cut through")
+        yield from self._jaws(tool, 0.0)
+        yield from self._back(tool)
+
+    def _reach(self, tool: int, place: Array) -> Movement:
+        """Come to ``place`` the way the instrument points at home."""
+        turned = self._home[tool].quaternion
+        ahead = self._home[tool].matrix[:, 0]
+        yield from self._glide(tool, Rigid(place - STAND_OFF_MM * ahead, turned))
+        here = self._pose[tool]
+        wander, self._hand = self._hand, replace(self._hand, wander_mm=0.0)
+        yield from self._glide(tool, Rigid(place, here.quaternion), 0.5)
+        self._hand = wander
+
+    def _back(self, tool: int) -> Movement:
+        here = self._pose[tool]
+        yield from self._glide(tool, Rigid(here.position - STAND_OFF_MM * here.matrix[:, 0], here.quaternion))
+
+    def _miss(self) -> Array:
+        return self._rng.normal(0.0, 1.0, 3) * self._hand.aim_error_mm
