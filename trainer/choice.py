@@ -21,7 +21,7 @@ from typing import Any
 
 from trainer import config
 from trainer.config import ConfigError
-from trainer.curriculum import SolverSpec, Task, ThreadSpec, VesselSpec
+from trainer.curriculum import AnatomySpec, SolverSpec, Task, ThreadSpec, VesselSpec
 from trainer.data_files import data_folder
 
 #: The rows that are like a task: an instrument leads a vessel's end that is cut free at 100 frames a second.
@@ -86,6 +86,16 @@ def thread_method(thread: ThreadSpec | None) -> dict[str, Any] | None:
         "links": round(thread.length_mm / thread.link_mm),
         "link_mm": thread.link_mm,
         "source": "Brown et al. 2001, section 4; keeps lengths exactly, so it has no setting",
+    }
+
+
+def region_method(anatomy: AnatomySpec | None) -> dict[str, Any] | None:
+    """What moves the tissue of a region, in words; None where no region is."""
+    if anatomy is None:
+        return None
+    return {
+        "method": "ChainMail and elastic relaxation",
+        "source": "Gibson et al. 1998, section 3.2; limits and time constant are the task's",
     }
 
 

@@ -272,6 +272,7 @@ class Scene:
             needle_radius_mm=0.5 * scene.needle.wire_mm if scene.needle else 0.0,
             thread_radius_mm=0.5 * scene.thread.diameter_mm.value if scene.thread else 0.0,
             clouds=_clouds(world),
+            **_eye(world),
         )
 
     def frame(self) -> Frame:
@@ -334,3 +335,15 @@ def _moving_clouds(world: World) -> tuple[Array, ...]:
         return ()
     moving = [region.elements[name] for name in structures() if name in region.elements]
     return tuple(world.world_from_scene.apply(region.places(elements)) for elements in moving)
+
+
+def _eye(world: World) -> dict[str, tuple[float, float, float]]:
+    """Where a recording looks from: at a region from the front of its scene's z, so far that all of it shows."""
+    region = world.region
+    if region is None:
+        return {}
+    size = np.array(region.volume.shape) * region.volume.spacing_mm
+    middle = region.origin + 0.5 * size
+    # Not straight down: the recording's view has +z up.
+    eye = middle + 1.1 * float(size.max()) * np.array([0.0, -0.25, 1.0])
+    return {"eye_mm": world.place_in_world(eye), "look_at_mm": world.place_in_world(middle)}

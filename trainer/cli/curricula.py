@@ -115,7 +115,8 @@ def _print_task(reference: str, task: Task) -> None:
     for name, limit in task.limits.items():
         print(f"  {name}: {limit.value:g} {limit.unit}  [{limit.source}]")
     budget = task.solver
-    print(f"\nTissue\n  right to {budget.node_error_mm:g} mm and {budget.force_error_mN:g} mN of unbalanced force")
+    if task.scene.vessel:
+        print(f"\nTissue\n  right to {budget.node_error_mm:g} mm and {budget.force_error_mN:g} mN of unbalanced force")
     print("\nMeasured")
     for metric in task.metric:
         target = wording.band(metric.low, metric.high, definition_of(metric.name, task).unit) or "no target"
@@ -128,6 +129,10 @@ def _print_task(reference: str, task: Task) -> None:
         _print_component("needle", scene.needle)
     if scene.thread is not None:
         _print_component("thread", scene.thread)
+    if scene.anatomy is not None:
+        print(f"  section {scene.anatomy.section}")
+        for tissue in scene.anatomy.tissue:
+            _print_component(tissue.structure, tissue)
     for instrument in scene.instrument:
         _print_component(f"instrument {instrument.tool}", instrument)
 

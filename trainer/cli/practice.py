@@ -83,7 +83,7 @@ def perform(
     Whatever can be refused is refused before the session enters the log. Raises ConfigError for a task or
     device that cannot be used, LogError and RecordingError where they cannot be written.
     """
-    from trainer.choice import choose_tissue, thread_method
+    from trainer.choice import choose_tissue, region_method, thread_method
     from trainer.cli.progress import Progress
     from trainer.cli.warmup import announce, warm_up
     from trainer.drivers import open_driver
@@ -143,6 +143,7 @@ def perform(
         "methods": {
             "tissue": None if tissue is None else asdict(tissue),
             "thread": thread_method(task.scene.thread),
+            "region": region_method(task.scene.anatomy),
         },
         "realtime": pace,
         "device": {"name": device, "seed": seed, **seen},

@@ -46,7 +46,7 @@ def print_result(result: dict[str, Any], task: Task) -> None:
 
 def _methods(methods: dict[str, Any]) -> str:
     """What moved the tissue and the thread, in a line."""
-    tissue, thread = methods["tissue"], methods["thread"]
+    tissue, thread, region = methods["tissue"], methods["thread"], methods["region"]
     said = []
     if tissue is not None:
         said.append(f"tissue by {tissue['method']} to {tissue['tolerance_mN']:.2g} mN")
@@ -54,6 +54,8 @@ def _methods(methods: dict[str, Any]) -> str:
             said[0] += f" ({tissue['cheapest']['method']} would be cheaper, but cannot run in a scene)"
     if thread is not None:
         said.append(f"thread by {thread['method']}")
+    if region is not None:
+        said.append(f"tissue by {region['method']}")
     return "; ".join(said) or "none"
 
 

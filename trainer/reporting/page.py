@@ -15,7 +15,7 @@ from trainer.config import read_text
 from trainer.data_files import data_folder
 from trainer.reporting import figures, wording
 from trainer.reporting.progress import Attempt, Curve, ProgressReport, ProgressRow, TaskProgress
-from trainer.reporting.session import EventLine, MetricRow, SessionReport, StitchMap
+from trainer.reporting.session import EventLine, Histogram, MetricRow, SessionReport, StitchMap, TissueRow
 from trainer.reporting.summary import curve_words, session_summary, task_summary
 
 MAP_CAPTION = (
@@ -66,10 +66,7 @@ def session_page(report: SessionReport) -> str:
             ("Session", report.session),
         ),
         summary=escape(session_summary(report)),
-        stitch_map=figures.stitch_map(report.stitch_map),
-        map_caption=escape(MAP_CAPTION + _stitch_words(report.stitch_map)),
-        histogram=figures.angle_histogram(report.histogram),
-        histogram_caption=escape(_passes(sum(report.histogram.counts)) + ", in bins of 5°."),
+        **_where(report.stitch_map, report.histogram, report.tissue, "", ""),
         targets=targets,
         others=_other_groups(report.others),
         events=_event_table(report.events),
@@ -149,7 +146,7 @@ def _target(row: MetricRow) -> str:
 
 
 def _other_groups(rows: tuple[MetricRow, ...]) -> str:
-    order = {"Needle": 0, "Stitch": 1, "Motion": 2, "Handling": 3}
+    order = {"Needle": 0, "Stitch": 1, "Tissue": 2, "Motion": 3, "Handling": 4}
     parts = []
     for family, group in groupby(sorted(rows, key=lambda r: order.get(r.family, 9)), key=lambda r: r.family):
         cells = ([_named(r), escape(wording.quantity(r.value, r.unit))] for r in group)
@@ -169,6 +166,34 @@ def _event_table(lines: tuple[EventLine, ...]) -> str:
         for e in lines
     )
     return _table(head, rows, "events")
+
+
+def _where(
+    shown: StitchMap, angles: Histogram, tissue: tuple[TissueRow, ...], origin: str, span: str
+) -> dict[str, str]:
+    """The figures of what the instruments did: where the needle went, or what was done to which structure."""
+    if tissue:
+        return {"map_title": "What was done to which structure", "map": _tissue_table(tissue)}
+    drawn = _fill(
+        "needle.html",
+        stitch_map=figures.stitch_map(shown),
+        map_caption=escape(origin + MAP_CAPTION + _stitch_words(shown)),
+        histogram=figures.angle_histogram(angles),
+        histogram_caption=escape(f"{_passes(sum(angles.counts))}{span}, in bins of 5°."),
+    )
+    return {"map_title": "Where the needle went", "map": drawn}
+
+
+def _tissue_table(rows: tuple[TissueRow, ...]) -> str:
+    names = ("grasps", "tip contacts", "tacked", "cut", "torn")
+    return _table(
+        (("Structure", ""), *((name, "n") for name in names)),
+        (
+            [escape(r.structure), str(r.grasps), str(r.contacts)]
+            + [wording.quantity(v, "mm3") for v in (r.tacked_mm3, r.cut_mm3, r.torn_mm3)]
+            for r in rows
+        ),
+    )
 
 
 def _stitch_words(shown: StitchMap) -> str:
@@ -204,10 +229,7 @@ def _task_section(task: TaskProgress, sources: Sources) -> str:
         summary=escape(task_summary(task)),
         curves=curves,
         rows=_progress_table(task.rows, sources),
-        stitch_map=figures.stitch_map(task.stitch_map),
-        map_caption=escape(f"From {sessions}. {MAP_CAPTION}{_stitch_words(task.stitch_map)}"),
-        histogram=figures.angle_histogram(task.histogram),
-        histogram_caption=escape(f"{_passes(sum(task.histogram.counts))} in all sessions, in bins of 5°."),
+        **_where(task.stitch_map, task.histogram, task.tissue, f"From {sessions}. ", " in all sessions"),
         attempts=_attempt_table(task.attempts, task.curves),
     )
 

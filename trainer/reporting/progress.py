@@ -10,7 +10,16 @@ from trainer.log.record import SessionRecord
 from trainer.metrics import Definition, definition_of, score
 from trainer.metrics.learning import Trend, recent, trend
 from trainer.metrics.performance import Performance
-from trainer.reporting.session import Histogram, MetricRow, StitchMap, histogram, metric_row, stitch_map
+from trainer.reporting.session import (
+    Histogram,
+    MetricRow,
+    StitchMap,
+    TissueRow,
+    histogram,
+    metric_row,
+    stitch_map,
+    tissue_rows,
+)
 
 #: Metrics that have a learning curve.
 CURVES = ("time_s", "entry_angle_error_deg")
@@ -70,6 +79,7 @@ class TaskProgress:
     stitch_map: StitchMap  # of the last sessions
     map_sessions: int
     histogram: Histogram  # of all sessions
+    tissue: tuple[TissueRow, ...]  # of the last session
 
     @property
     def completed(self) -> int:
@@ -127,6 +137,7 @@ def _task_progress(name: str, records: list[SessionRecord]) -> TaskProgress:
         stitch_map=_merged([stitch_map(p) for p in performances[-MAP_SESSIONS:]]),
         map_sessions=min(len(records), MAP_SESSIONS),
         histogram=histogram(performances, task),
+        tissue=tissue_rows(performances[-1]),
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from trainer.curriculum import Task
-from trainer.events import Event, Pierce, TickOverrun, TrackingBack, TrackingLost
+from trainer.events import Cut, Event, Grasp, Pierce, Probe, Tack, Tear, TickOverrun, TrackingBack, TrackingLost
 from trainer.log.record import Metric, SessionRecord
 from trainer.metrics import FAMILIES, definition_of, score
 from trainer.metrics.performance import Performance
@@ -92,6 +92,18 @@ class Histogram:
 
 
 @dataclass(frozen=True)
+class TissueRow:
+    """What was done to one structure of a region."""
+
+    structure: str
+    grasps: int
+    contacts: int  # of an instrument's tip with what is rigid
+    tacked_mm3: float
+    cut_mm3: float
+    torn_mm3: float
+
+
+@dataclass(frozen=True)
 class EventLine:
     """An event, several alike in a row, or a hand's losses of sight between two things that it did."""
 
@@ -122,6 +134,7 @@ class SessionReport:
     others: tuple[MetricRow, ...]
     stitch_map: StitchMap
     histogram: Histogram
+    tissue: tuple[TissueRow, ...]  # empty where the task has no region of the anatomy
     events: tuple[EventLine, ...]
     overruns: int  # ticks that took longer than their slot
 
@@ -152,6 +165,7 @@ def session_report(record: SessionRecord, task: Task) -> SessionReport:
         others=tuple(r for r in rows if not r.has_target),
         stitch_map=stitch_map(performance),
         histogram=histogram([performance], task),
+        tissue=tissue_rows(performance),
         events=event_lines(record.events),
         overruns=sum(isinstance(e, TickOverrun) for e in record.events),
     )
@@ -202,6 +216,30 @@ def histogram(performances: list[Performance], task: Task) -> Histogram:
                 counts[min(int(angle // BIN_DEG), len(counts) - 1)] += 1
     target = next((t for t in task.metric if t.name == "entry_angle_deg"), None)
     return Histogram(tuple(counts), target.low if target else None, target.high if target else None)
+
+
+def tissue_rows(performance: Performance) -> tuple[TissueRow, ...]:
+    """What was done to each structure of the task's region: the movable ones, and others that were touched."""
+    anatomy = performance.task.scene.anatomy
+    if anatomy is None:
+        return ()
+    done = [e for e in performance.record.events if isinstance(e, Grasp | Probe | Tack | Cut | Tear) and e.body]
+    names = dict.fromkeys([*(t.structure for t in anatomy.tissue), *(e.body for e in done)])
+
+    def volume(kind: type[Tack] | type[Cut] | type[Tear], name: str) -> float:
+        return sum((e.volume_mm3 for e in performance.events(kind) if e.body == name), 0.0)
+
+    return tuple(
+        TissueRow(
+            structure=name,
+            grasps=sum(isinstance(e, Grasp) and e.body == name for e in done),
+            contacts=sum(isinstance(e, Probe) and e.body == name for e in done),
+            tacked_mm3=volume(Tack, name),
+            cut_mm3=volume(Cut, name),
+            torn_mm3=volume(Tear, name),
+        )
+        for name in names
+    )
 
 
 def event_lines(events: tuple[Event, ...]) -> tuple[EventLine, ...]:

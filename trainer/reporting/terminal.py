@@ -12,7 +12,7 @@ from rich.table import Table
 
 from trainer.reporting import wording
 from trainer.reporting.progress import Curve, ProgressReport, ProgressRow, TaskProgress
-from trainer.reporting.session import Bite, MetricRow, SessionReport
+from trainer.reporting.session import Bite, MetricRow, SessionReport, TissueRow
 from trainer.reporting.summary import curve_words, session_summary, task_summary
 
 #: Cells of a target strip.
@@ -32,6 +32,7 @@ def print_session(report: SessionReport, console: Console) -> None:
     console.print(f"{escape(session_summary(report))}\n")
     _print_targets(report.targets, console)
     _print_bites(report, console)
+    _print_tissue(report, console)
     _print_others(report.others, console)
     events = Table("time", "hand", "event", "", box=None, pad_edge=False, header_style="dim")
     events.columns[0].justify = "right"
@@ -140,6 +141,19 @@ def _print_bites(report: SessionReport, console: Console) -> None:
         return [*place, error, str(b.pass_number), "" if b.kept else "left again"]
 
     _print_rows(head, [cells(b) for b in report.stitch_map.bites], console)
+
+
+def _print_tissue(report: SessionReport, console: Console) -> None:
+    if not report.tissue:
+        return
+    names = ("grasps", "tip contacts", "tacked", "cut", "torn")
+    head = (("structure", "left"), *((name, "right") for name in names))
+
+    def cells(r: TissueRow) -> list[str]:
+        volumes = [wording.quantity(v, "mm3") for v in (r.tacked_mm3, r.cut_mm3, r.torn_mm3)]
+        return [escape(r.structure), str(r.grasps), str(r.contacts), *volumes]
+
+    _print_rows(head, [cells(r) for r in report.tissue], console)
 
 
 def _print_others(rows: tuple[MetricRow, ...], console: Console) -> None:

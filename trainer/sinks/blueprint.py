@@ -1,24 +1,23 @@
-"""How a recording opens: the stitch, forces over time, what the hands hold, the log and the scores."""
+"""How a recording opens: the scene, forces over time, what the hands hold, the log and the scores."""
 
 from __future__ import annotations
 
 import rerun.blueprint as rrb
 
-#: Where the eye is and what it looks at, mm: from above and the near side, as through a microscope.
-EYE_MM = (1.4, -4.8, 3.9)
-LOOK_AT_MM = (0.15, 0.0, 0.75)
 BACKGROUND = (24, 30, 38)
 
 
-def blueprint() -> rrb.Blueprint:
-    """The arrangement that travels inside the recording."""
-    stitch = rrb.Spatial3DView(
+def blueprint(
+    eye_mm: tuple[float, float, float], look_at_mm: tuple[float, float, float]
+) -> rrb.Blueprint:
+    """The arrangement that travels inside the recording, and where its eye is."""
+    scene = rrb.Spatial3DView(
         origin="/world",
-        name="Stitch",
+        name="Scene",
         background=rrb.Background(color=BACKGROUND),
         line_grid=rrb.LineGrid3D(visible=False),
         eye_controls=rrb.EyeControls3D(
-            kind=rrb.Eye3DKind.Orbital, position=EYE_MM, look_target=LOOK_AT_MM, eye_up=(0.0, 0.0, 1.0)
+            kind=rrb.Eye3DKind.Orbital, position=eye_mm, look_target=look_at_mm, eye_up=(0.0, 0.0, 1.0)
         ),
     )
     forces = rrb.TimeSeriesView(origin="/force", name="Force (mN)")
@@ -32,7 +31,7 @@ def blueprint() -> rrb.Blueprint:
     scores = rrb.TextDocumentView(origin="/scores", name="Scores")
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Vertical(stitch, states, row_shares=[3, 1]),
+            rrb.Vertical(scene, states, row_shares=[3, 1]),
             rrb.Vertical(forces, rrb.Tabs(scores, closures), log, row_shares=[2, 2, 3]),
             column_shares=[3, 2],
         ),

@@ -114,7 +114,7 @@ class RecordingSink:
             batcher_config=rr.ChunkBatcherConfig(flush_tick=datetime.timedelta(days=1)),
         )
         self._stream.set_log_time_enabled(False)
-        self._file = RrdFile(self.path, self._stream, blueprint())
+        self._file = RrdFile(self.path, self._stream, blueprint(layout.eye_mm, layout.look_at_mm))
         self._log_header()
         self._log_layout()
 
@@ -226,6 +226,12 @@ class RecordingSink:
                 albedo_factor=STEEL,
             )
             log(f"world/instruments/{part.name}", mesh, static=True)
+        for cloud in layout.clouds:
+            if cloud.fixed is not None:
+                balls = rr.Points3D(cloud.fixed, radii=cloud.radius_mm, colors=cloud.rgba)
+            else:
+                balls = rr.Points3D.from_fields(radii=cloud.radius_mm, colors=cloud.rgba)
+            log(f"world/{cloud.name}", balls, static=True)
         if layout.needle is not None:
             needle = rr.LineStrips3D([layout.needle], radii=layout.needle_radius_mm, colors=NEEDLE)
             log("world/needle", needle, static=True)
@@ -244,6 +250,9 @@ class RecordingSink:
                 vertex_normals=_rounded(_normals(vertices, surface.triangles), NORMAL_STEP),
             )
             log(f"world/{surface.name}", mesh)
+        moving = [cloud for cloud in self._layout.clouds if cloud.fixed is None]
+        for cloud, points in zip(moving, frame.clouds, strict=True):
+            log(f"world/{cloud.name}", rr.Points3D.from_fields(positions=_rounded(points, VERTEX_STEP_MM)))
         for k, part in enumerate(self._layout.parts):
             log(f"world/instruments/{part.name}", _transform(frame.part_position[k], frame.part_quaternion[k]))
         if frame.needle_position is not None and frame.needle_quaternion is not None:

@@ -55,6 +55,9 @@ class Layout:
     needle_radius_mm: float
     thread_radius_mm: float
     clouds: tuple[Cloud, ...] = ()
+    #: Where the eye is and what it looks at, mm: on a stitch from above and the near side, as through a microscope.
+    eye_mm: tuple[float, float, float] = (1.4, -4.8, 3.9)
+    look_at_mm: tuple[float, float, float] = (0.15, 0.0, 0.75)
 
 
 @dataclass(frozen=True)
