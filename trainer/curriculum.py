@@ -140,7 +140,7 @@ class InstrumentSpec:
     grip_mN: Sourced = field(metadata=FORCE_MN)  # the most the fully closed jaws hold against a pull
     close_at: float = field(default=0.7, metadata={"bounds": Bounds(0.05, 1.0)})  # closure that grasps
     open_at: float = field(default=0.5, metadata={"bounds": Bounds(0.0, 0.95)})  # closure that lets go
-    tack_at: float | None = field(default=None, metadata={"bounds": Bounds(0.05, 1.0)})  # closure that tacks held tissue
+    tack_at: float | None = field(default=None, metadata={"bounds": Bounds(0.05, 1.0)})  # closure that tacks tissue
 
     def __post_init__(self) -> None:
         if self.open_at >= self.close_at:

@@ -161,7 +161,7 @@ class Break(Event):
 
 @dataclass(frozen=True)
 class Tear(Event):
-    """A wall gave way: a hole pulled out, or grasped tissue ripped from the jaws. A volume: links beyond their limits."""
+    """A wall gave way: a hole pulled out, or grasped tissue ripped from the jaws; or links of a volume did."""
 
     kind = "tear"
     body: str  # vessel or structure

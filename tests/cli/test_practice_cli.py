@@ -67,7 +67,7 @@ def test_the_document_says_all_that_the_contract_asks(command_line: CommandLine,
     assert set(found["realtime"]) == {"tick_hz", "overruns", "p50_ms", "p99_ms", "max_ms"}
     assert 0.0 < found["realtime"]["p50_ms"] <= found["realtime"]["p99_ms"] <= found["realtime"]["max_ms"]
     assert found["device"]["name"] == "scripted-expert"
-    assert set(found["methods"]) == {"tissue", "thread"}
+    assert set(found["methods"]) == {"tissue", "thread", "region"}
     tissue = found["methods"]["tissue"]
     assert tissue == asdict(choose_tissue(curriculum.load_task(str(task)).task, str(task)))
     assert tissue["measured_error_mm"] <= tissue["budget"]["node_error_mm"] == 0.003

@@ -11,13 +11,17 @@ import numpy as np
 
 from trainer.curriculum import Task, load_task
 from trainer.events import (
+    Cut,
     Event,
     Grasp,
     Pierce,
+    Probe,
     PullThrough,
     StepDone,
+    Tack,
     TaskDone,
     TaskStarted,
+    Tear,
     Vector,
     Withdraw,
 )
@@ -26,6 +30,8 @@ from trainer.log.record import SessionHeader, SessionRecord
 
 STITCH = "anastomosis/single-stitch"
 DRIVE = "anastomosis/needle-drive"
+LIGAMENT = "arthroscopy/ligament-2d"
+PCL = "posterior cruciate ligament"
 TICK_HZ = 100.0
 TOOLS = ("left", "right")
 
@@ -128,6 +134,36 @@ def stitch(bite_a: float = 0.35, bite_b: float = 0.35, clock_a: float = 0.0, clo
         StepDone(**at(1700, 0, ""), step="draw the ends together", index=3),
         TaskDone(**at(1700, 1, ""), outcome="completed", reason="", needle_tip=drawn, needle_tangent=(1.0, 0.0, 0.0),
                  thread_end=drawn, thread_length_error=1e-9, tail_mm=2.4, gap_mm=0.08),
+    )  # fmt: skip
+
+
+def ligament() -> SessionRecord:
+    """A whole ``ligament-2d``: grasped 3 mm and cut 4 mm from the marks, the tibia touched once, 12 mm³ torn.
+
+    The marks are at (-4, -14, 0) and (0, -7, 0) mm; the two strokes' mean, weighed 3 to 1, is at (4, -7, 0).
+    """
+    zero = (0.0, 0.0, 0.0)
+    names = [s.name for s in task_of(LIGAMENT).step]
+    left, right = {"tool": "left"}, {"tool": "right"}
+    return record(
+        (
+            TaskStarted(**at(0, tool=""), task=LIGAMENT),
+            Grasp(**at(100, **left), target="tissue", body=PCL, arc_mm=0.0, point=(-4.0, -11.0, 0.0), force_mN=5e4),
+            StepDone(**at(100, 1, ""), step=names[0], index=0),
+            StepDone(**at(150, 0, ""), step=names[1], index=1),
+            Tear(**at(160, tool=""), body=PCL, wall="", hole=-1, point=zero, force_mN=9e3, limit_mN=0.0,
+                 volume_mm3=12.0),
+            Tack(**at(170, **left), body=PCL, point=zero, volume_mm3=90.0, force_mN=8e3),
+            StepDone(**at(170, 1, ""), step=names[2], index=2),
+            Probe(**at(180, **right), body="tibia", point=zero),
+            Cut(**at(200, **right), body=PCL, point=(3.0, -7.0, 0.0), volume_mm3=60.0),
+            Cut(**at(250, **right), body=PCL, point=(7.0, -7.0, 0.0), volume_mm3=20.0),
+            StepDone(**at(250, 1, ""), step=names[3], index=3),
+            StepDone(**at(260, 0, ""), step=names[4], index=4),
+            TaskDone(**at(260, 1, ""), outcome="completed", reason="", needle_tip=zero, needle_tangent=(1.0, 0.0, 0.0),
+                     thread_end=zero, thread_length_error=0.0, tail_mm=0.0, gap_mm=1.6, pull_max_mN=9e3),
+        ),
+        reference=LIGAMENT,
     )  # fmt: skip
 
 

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.metrics.synthetic_session import DRIVE, STITCH, performed, record, stitch, task_of
+from tests.metrics.synthetic_session import DRIVE, LIGAMENT, STITCH, ligament, performed, record, stitch, task_of
 from trainer.config import ConfigError
 from trainer.curriculum import MetricTarget, family_names, load_family
 from trainer.events import KINDS, Event, Vector
@@ -20,7 +20,7 @@ from trainer.log.record import SessionRecord
 from trainer.metrics import FAMILIES, REGISTRY, Definition, available, score
 from trainer.metrics.registry import NO_TARGET
 
-UNITS = {"deg", "mm", "s", "mN", "count", "ratio"}
+UNITS = {"deg", "mm", "mm3", "s", "mN", "count", "ratio"}
 TASKS = [f"{family}/{task}" for family in family_names() for task in load_family(family).tasks]
 
 NUMBERS = st.floats(-1e6, 1e6)
@@ -28,7 +28,7 @@ WORDS = {
     "body": st.sampled_from(["A", "B", "", "C"]),
     "wall": st.sampled_from(["outer", "inner"]),
     "direction": st.sampled_from(["in", "out"]),
-    "target": st.sampled_from(["needle", "thread", "wall"]),
+    "target": st.sampled_from(["needle", "thread", "wall", "tissue"]),
 }
 
 
@@ -76,7 +76,7 @@ def test_every_metric_says_what_it_is(definition: Definition) -> None:
     assert definition.version
     assert definition.meaning.endswith(".")
     assert len(definition.meaning) <= 120
-    suffix = {"deg": "_deg", "mm": "_mm", "s": "_s", "mN": "_mN"}.get(definition.unit, "")
+    suffix = {"deg": "_deg", "mm": "_mm", "mm3": "_mm3", "s": "_s", "mN": "_mN"}.get(definition.unit, "")
     assert definition.name.endswith(suffix)
     assert definition.measure.__module__ in {family.__name__ for family in FAMILIES}
 
@@ -84,9 +84,11 @@ def test_every_metric_says_what_it_is(definition: Definition) -> None:
 @pytest.mark.parametrize("definition", REGISTRY.values(), ids=list(REGISTRY))
 def test_every_metric_has_a_value_on_a_whole_performance(definition: Definition) -> None:
     """So that no metric is silently None for ever; placement and all others exist on a finished stitch."""
-    made = performed(seed=1)
-    values = {m.name: m.value for m in score(made, task_of())}
-    names = [n for n, d, _ in available(task_of()) if d is definition]
+    made, task = performed(seed=1), task_of()
+    if not definition.applies(task):
+        made, task = ligament(), task_of(LIGAMENT)
+    values = {m.name: m.value for m in score(made, task)}
+    names = [n for n, d, _ in available(task) if d is definition]
     assert names
     if definition.name not in {"economy_{tool}"}:  # the left hand does one thing only
         assert all(values[n] is not None for n in names)

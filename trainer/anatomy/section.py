@@ -5,6 +5,7 @@ Its frame is the drawing's: x to the front, y up, the layer in the middle of z =
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -94,7 +95,7 @@ def _inside(points: Array, x: Array, y: Array) -> np.ndarray:
 def _distance(points: Array, x: Array, y: Array) -> Array:
     """Distance to the line through points (n, 2); to the point where there is one."""
     least = np.hypot(x - points[0, 0], y - points[0, 1])
-    for a, b in zip(points, points[1:], strict=False):
+    for a, b in itertools.pairwise(points):
         way = b - a
         t = np.clip(((x - a[0]) * way[0] + (y - a[1]) * way[1]) / (way @ way), 0.0, 1.0)
         least = np.minimum(least, np.hypot(x - a[0] - t * way[0], y - a[1] - t * way[1]))

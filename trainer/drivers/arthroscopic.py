@@ -44,6 +44,9 @@ class ArthroscopicHands(Hands):
         self._grasper = kinds.index("grasper")
         self._scissors = kinds.index("scissors") if "scissors" in kinds else -1
 
+    def _begin(self, view: View) -> None:
+        self._view = view
+
     def _look(self, view: View) -> None:
         self._view = view
 

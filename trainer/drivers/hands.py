@@ -44,6 +44,7 @@ class Hands(ABC):
     def poll(self, tick: int, view: object) -> ToolPoses | None:
         assert isinstance(view, View)
         if self._plan is None:
+            self._begin(view)
             self._plan = self._perform()
         self._look(view)
         try:
@@ -65,6 +66,10 @@ class Hands(ABC):
 
     def close(self) -> None:
         self._plan = None
+
+    @abstractmethod
+    def _begin(self, view: View) -> None:
+        """Take in the scene for the first time."""
 
     @abstractmethod
     def _look(self, view: View) -> None:

@@ -42,8 +42,12 @@ class ScriptedHands(Hands):
         self._needle_length = needle.length_mm if needle else 0.0
         self._radius = needle.length_mm / math.radians(needle.arc_deg) if needle else 1.0
 
-    def _look(self, view: View) -> None:
+    def _begin(self, view: View) -> None:
+        # One sight for the whole plan, which asks it at later ticks.
         self._see = Sight(self._task, view, self._needle_length, self._radius)
+
+    def _look(self, view: View) -> None:
+        self._see.view = view
 
     # --- the plan ------------------------------------------------------------------------------------------------
 

@@ -90,7 +90,7 @@ class Region:
         return float(len(elements) * self.volume.element_mm3)
 
     def note(self, change: Change) -> dict[str, Indices]:
-        """Remember what a cut or tear has opened and severed; returns the elements (k,) that lost a link by structure."""
+        """Remember what a cut or tear has opened and severed; returns by structure what (k,) lost a link."""
         labels = self.volume.labels.reshape(-1)[change.elements]
         found = {s: change.elements[labels == number_of(s)] for s in self.elements}
         found = {s: lost for s, lost in found.items() if len(lost)}

@@ -109,9 +109,7 @@ def _mean_error(performance: Performance, kind: str, event: type[Grasp] | type[C
         until = (done.tick, done.seq)
         if step.kind == kind:
             here = [
-                e
-                for e in performance.events(event)
-                if e.body == step.structure and since < (e.tick, e.seq) < until
+                e for e in performance.events(event) if e.body == step.structure and since < (e.tick, e.seq) < until
             ]
             if here:
                 weights = [max(e.volume_mm3, 1e-9) if isinstance(e, Cut) else 1.0 for e in here]

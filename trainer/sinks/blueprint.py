@@ -7,9 +7,7 @@ import rerun.blueprint as rrb
 BACKGROUND = (24, 30, 38)
 
 
-def blueprint(
-    eye_mm: tuple[float, float, float], look_at_mm: tuple[float, float, float]
-) -> rrb.Blueprint:
+def blueprint(eye_mm: tuple[float, float, float], look_at_mm: tuple[float, float, float]) -> rrb.Blueprint:
     """The arrangement that travels inside the recording, and where its eye is."""
     scene = rrb.Spatial3DView(
         origin="/world",
