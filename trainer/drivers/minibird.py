@@ -118,11 +118,12 @@ class Minibird:
         self._ticks = tick
         self._fresh.clear()
         valid = np.asarray(self._home.valid, dtype=bool).copy()
+        reasons = [""] * len(valid)
         for instrument in self._instruments:
-            reason = self._follow(instrument, now)
+            reasons[instrument.tool] = reason = self._follow(instrument, now)
             valid[instrument.tool] = not reason
             self._note(instrument, tick, reason)
-        return ToolPoses(self._position.copy(), self._quaternion.copy(), self._jaws.copy(), valid)
+        return ToolPoses(self._position.copy(), self._quaternion.copy(), self._jaws.copy(), valid, tuple(reasons))
 
     def _follow(self, instrument: _Instrument, now: float) -> str:
         """Bring an instrument to where its bird is; "" or why that is not known."""
