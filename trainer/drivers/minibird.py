@@ -6,6 +6,7 @@ counts as not seen: the scene leaves the instrument where it is, jaws and all, a
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from array import array
@@ -43,6 +44,7 @@ class _Instrument:
 
     bird: Bird
     tool: int
+    sensor_from_tool: Rigid
     newest: Sample | None = None  # the last without flaw; written by the thread that reads
     flaw: str = ""  # of the last sample; written by the same thread
     used: Sample | None = None
@@ -65,8 +67,10 @@ class Minibird:
     ) -> None:
         """Connects and configures; the stream begins with the first poll. Raises ConfigError, DeviceError."""
         self._spec = spec
-        self._scene_from_device = Rigid(np.array(spec.position_mm), quaternion_from_euler_deg(spec.rotation_deg))
-        self._instruments = [_Instrument(bird, tools.index(bird.tool)) for bird in spec.bird if bird.tool in tools]
+        self._scene_from_device = _rigid(spec)
+        self._instruments = [
+            _Instrument(bird, tools.index(bird.tool), _rigid(bird)) for bird in spec.bird if bird.tool in tools
+        ]
         if not self._instruments:
             raise ConfigError(
                 f"the device moves {', '.join(b.tool for b in spec.bird)}; the task has {', '.join(tools)}"
@@ -141,8 +145,7 @@ class Minibird:
         if sample is not instrument.used:
             pose = self._place(instrument, sample)
             if self._closure is not None and self._closure.has(tool) and instrument.used is not None:
-                way = np.linalg.norm(np.subtract(sample.position, instrument.used.position))
-                self._closure.moved(tool, float(way), now)
+                self._closure.moved(tool, math.dist(sample.position, instrument.used.position), now)
             self._position[k], self._quaternion[k] = pose.position, pose.quaternion
             instrument.used = sample
             self._fresh.append(sample)
@@ -151,14 +154,12 @@ class Minibird:
 
     def _place(self, instrument: _Instrument, sample: Sample) -> Rigid:
         """world_from_tool = anchor · scene_from_device · (scale · position, rotation) · sensor_from_tool."""
-        bird = instrument.bird
         turn = np.array(sample.quaternion)
-        if self._stream.inverse[bird.address]:
+        if self._stream.inverse[instrument.bird.address]:
             turn = quaternion_conjugate(turn)
         position = field_distortion.correct(np.array([sample.position]), self._spec.distortion)[0]
         device_from_sensor = Rigid(self._spec.scale * position, turn)
-        sensor_from_tool = Rigid(np.array(bird.position_mm), quaternion_from_euler_deg(bird.rotation_deg))
-        pose = self._scene_from_device @ device_from_sensor @ sensor_from_tool
+        pose = self._scene_from_device @ device_from_sensor @ instrument.sensor_from_tool
         if self._spec.anchor == "none":
             return pose
         if instrument.anchor is None:
@@ -211,6 +212,10 @@ class Minibird:
         self._stream.close()
         if self._closure is not None:
             self._closure.close()
+
+
+def _rigid(placed: MinibirdSpec | Bird) -> Rigid:
+    return Rigid(np.array(placed.position_mm), quaternion_from_euler_deg(placed.rotation_deg))
 
 
 def _loss(instrument: _Instrument, ticks: int, tick_s: float) -> dict[str, object]:

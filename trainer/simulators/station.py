@@ -87,7 +87,7 @@ class Station:
             time_s = float(self._hands.time[min(self._sample, len(self._hands.time) - 1)])
         else:
             time_s = self._motion_s(time.monotonic())
-        return self._hands.at(time_s, self._birds[address])[0]
+        return self._hands.at(time_s, self._birds[address])
 
     def _happen(self, now: float) -> None:
         """What the faults have happen at this time of the motion."""
@@ -151,7 +151,7 @@ class Station:
             self._closure_s = now
             self._closure_line.send(BOOT, now)
         t, faults = self._motion_s(now), self._closure_faults
-        closure: dict[str, float] = {tool: self._hands.at(t, self._birds[a])[1] for a, tool in self._tools.items()}
+        closure: dict[str, float] = {tool: self._hands.closure_at(t, self._birds[a]) for a, tool in self._tools.items()}
         line = self._board.line(t, closure, faults.stuck.holds(t), faults.out_of_range.holds(t))
         if not faults.pause.holds(t):
             self._closure_line.send(line, self._closure_s)
