@@ -28,6 +28,7 @@ class ClockLine:
         self._nominal_s = period_s
         self._residual2 = 0.0  # s², sum over all samples of the session
         self._count = 0
+        self._mark = (0, 0.0, 0)  # the newest sample's number on its line, when it was due, the number of the line
         self._begin(0.0)
 
     def _begin(self, time_s: float) -> None:
@@ -47,8 +48,11 @@ class ClockLine:
         """
         if self._seen == 0 or arrived_s - self._newest_s > BREAK * self.period_s:
             self._begin(arrived_s)
+            number, line = 0, self._mark[2] + 1
         else:
-            self._shift(1 + self._lost(arrived_s), arrived_s - self._newest_s)
+            steps = 1 + self._lost(arrived_s)
+            number, line = self._mark[0] + steps, self._mark[2]
+            self._shift(steps, arrived_s - self._newest_s)
         self._seen += 1
         self._n += 1.0
         self._newest_s = arrived_s
@@ -57,7 +61,13 @@ class ClockLine:
         self._due_s = arrived_s + (self._t - self.period_s * self._i) / self._n
         self._residual2 += (arrived_s - self._due_s) ** 2
         self._count += 1
+        self._mark = (number, self._due_s, line)
         return self._due_s
+
+    def read(self, now_s: float) -> tuple[float, int]:
+        """How many samples the device's clock says at ``now_s``, and since which of its beginnings; from any thread."""
+        number, due_s, line = self._mark
+        return number + (now_s - due_s) / self.period_s, line
 
     def _lost(self, arrived_s: float) -> int:
         """How many samples are known by now to have been lost."""

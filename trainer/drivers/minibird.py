@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import sys
 import time
-from array import array
 from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
@@ -18,8 +17,9 @@ import numpy as np
 
 from trainer.config import ConfigError
 from trainer.drivers import field_distortion
-from trainer.drivers.clock_line import ClockLine
+from trainer.drivers.clock_line import WINDOW, ClockLine
 from trainer.drivers.closure import ClosureSensor
+from trainer.drivers.latency import LatencyCount
 from trainer.drivers.minibird_flock import UNHURRIED, Silences
 from trainer.drivers.minibird_record import Sample
 from trainer.drivers.minibird_stream import FlockStream
@@ -33,6 +33,8 @@ STALE_S = 0.1
 FIRST_S = 0.5
 #: How long a thread computes before it lets one that has read something have a turn; 5 ms by default. Assumed.
 SWITCH_S = 0.0005
+#: Drift is counted from when the device's line has so many samples: its window and the first lost ones are known.
+SETTLED = 2 * WINDOW
 #: As many losses are told one by one; a worse session is told by their number.
 MOST_LOSSES = 100
 MOST_REASONS = 4  # of one loss
@@ -82,7 +84,9 @@ class Minibird:
         self._jaws = home.closure.copy()
         self._begun_s: float | None = None
         self._line = ClockLine(1.0 / spec.rate_hz)
-        self._latency_ms = array("d")  # from a pose's first byte to its tick's events, of each pose that was used
+        self.latency = LatencyCount()  # from a pose's first byte to its tick's events, of each pose that was used
+        self._apart_s: float | None = None  # device's clock against the session's when both had begun
+        self._line_begun = 0
         self._fresh: list[Sample] = []  # poses that this tick uses and none used before
         self._ticks = 0
         self._losses: list[dict[str, object]] = []
@@ -183,24 +187,30 @@ class Minibird:
     def tick(self, record: object) -> None:
         """The events of a tick are with the sinks: how long did its poses take to become them?"""
         now = time.monotonic()
-        self._latency_ms.extend(1e3 * (now - sample.sent_s) for sample in self._fresh)
+        for sample in self._fresh:
+            self.latency.add(1e3 * (now - sample.sent_s))
         self._fresh.clear()
+
+    def drift_ticks(self) -> float:
+        """By how many ticks the session's clock has left the device's behind since both began; now, at any tick.
+
+        The device's clock counts its samples, lost ones too, at the rate that was asked for; a pause begins it anew.
+        """
+        samples, begun = self._line.read(time.monotonic())
+        apart_s = self._ticks * self._tick_s - samples / self._spec.rate_hz
+        if self._apart_s is None or begun != self._line_begun or samples < SETTLED:
+            self._apart_s, self._line_begun = apart_s, begun
+        return (apart_s - self._apart_s) / self._tick_s
 
     def summary(self) -> dict[str, object]:
         """What was read, how late, and when and why it was not."""
         still = [i for i in self._instruments if i.lost_tick is not None]
-        latency = np.array(self._latency_ms) if self._latency_ms else np.zeros(1)
         return {
             "driver": "minibird",
             "records": dict(sorted(self._stream.counts.items())),
             "measured_rate_hz": round(1.0 / self._line.period_s, 3),
             "jitter_ms": round(1e3 * self._line.jitter_s, 3),
-            "latency_ms": {
-                "poses": len(self._latency_ms),
-                "p50": round(float(np.percentile(latency, 50)), 3),
-                "p99": round(float(np.percentile(latency, 99)), 3),
-                "max": round(float(latency.max()), 3),
-            },
+            "latency_ms": self.latency.summary(),
             "restarts": self._stream.restarts,
             "losses": self._lost_count + len(still),
             "lost": self._losses + [_loss(i, self._ticks + 1 - (i.lost_tick or 0), self._tick_s) for i in still],

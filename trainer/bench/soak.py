@@ -1,0 +1,179 @@
+"""Does a station last? Hours of practice in minutes: sessions through simulated devices, in real time.
+
+A tracker pair and a closure sensor are played byte for byte on pseudo-terminals by another process, and move as the
+scripted expert did. For half of the time the stitch is sewn again and again, a session each; the second half is one
+session, in which the hands rest after the stitch. Once a second the gauges are read:
+
+* memory of this process (resident set), its slope by least squares from the end of the first session on, and in the
+  last session;
+* ticks that wait for the log's thread and frames that wait for the recording's; the device has no queue, its newest
+  pose wins;
+* drift: ticks by which the session's clock and the device's (its samples, counted at the rate it was asked for) have
+  come apart since both began.
+
+A pose's latency is the time from its first byte to its tick's events being out, by the driver. The device's clock is
+this machine's, so drift is what bytes, threads and pacing make of it, not what a tracker's crystal does.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import time
+from array import array
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+from trainer.clock import Realtime
+from trainer.drivers.latency import LatencyCount
+from trainer.drivers.minibird import Minibird
+
+EVERY_S = 1.0  # between two looks at the gauges
+TOLD_EVERY_S = 30.0
+PROFILE = "minibird-pair"
+#: A step that the resting hands never reach: needle and thread are out of every hole again.
+REST = '[[step]]\nname = "rest"\nkind = "withdraw"\n\n'
+
+
+@runtime_checkable
+class Queued(Protocol):
+    """A sink with a queue."""
+
+    @property
+    def waiting(self) -> int: ...
+
+
+@dataclass
+class Session:
+    """What became of one session."""
+
+    outcome: str = ""
+    ticks: int = 0
+    overruns: int = 0
+    losses: int = 0  # of an instrument
+    drift_ticks: float = 0.0  # the most, either way
+    waiting: dict[str, int] = field(default_factory=dict)  # the most, by sink
+
+
+@dataclass
+class Soak:
+    """All that was measured so far."""
+
+    sessions: list[Session] = field(default_factory=list)
+    at_s: array[float] = field(default_factory=lambda: array("d"))  # when the gauges were read, s from the start
+    rss_mb: array[float] = field(default_factory=lambda: array("d"))
+    session_of: array[int] = field(default_factory=lambda: array("l"))  # in which session
+    latency: LatencyCount = field(default_factory=LatencyCount)
+    work_ms: array[float] = field(default_factory=lambda: array("d"))
+    began_s: float = field(default_factory=time.monotonic)
+
+    def elapsed_s(self) -> float:
+        return time.monotonic() - self.began_s
+
+
+class Gauges:
+    """A sink that reads them once a second, and tells of them now and then."""
+
+    def __init__(self, soak: Soak, driver: object, sinks: Sequence[object], tell: Callable[[str], None]) -> None:
+        self._soak, self._driver, self._tell = soak, driver, tell
+        self._queues = {type(sink).__name__: sink for sink in sinks if isinstance(sink, Queued)}
+        self._session = soak.sessions[-1]
+        self._due_s = self._told_s = time.monotonic()
+
+    def tick(self, record: object) -> None:
+        for name, sink in self._queues.items():
+            self._session.waiting[name] = max(self._session.waiting.get(name, 0), sink.waiting)
+        now = time.monotonic()
+        if now < self._due_s:
+            return
+        self._due_s = now + EVERY_S
+        soak = self._soak
+        soak.at_s.append(soak.elapsed_s())
+        soak.rss_mb.append(rss_mb())
+        soak.session_of.append(len(soak.sessions) - 1)
+        if isinstance(self._driver, Minibird):
+            drift = self._driver.drift_ticks()
+            self._session.drift_ticks = max(self._session.drift_ticks, abs(drift))
+        if now - self._told_s >= TOLD_EVERY_S:
+            self._told_s = now
+            self._tell(
+                f"{soak.elapsed_s() / 60.0:5.1f} min, session {len(soak.sessions)}, {soak.rss_mb[-1]:.0f} MB, "
+                f"drift {self._session.drift_ticks:.2f} ticks"
+            )
+
+    def close(self) -> None:
+        """Nothing stays open."""
+
+
+Observed = Callable[[Any, Sequence[Any]], Gauges]
+#: Performs one session, given the device's profile, its clock, when to stop, what looks at device and sinks, and
+#: whether it goes on after the stitch; returns what ``trainer practice --json`` prints.
+Perform = Callable[[Path, Realtime, Callable[[], bool], Observed, bool], dict[str, Any]]
+
+
+def measure(
+    soak: Soak, perform: Perform, folder: Path, motion: str, tick_hz: float, minutes: float, tell: Callable[[str], None]
+) -> None:
+    """Fill ``soak``: sessions for half of the time, then one for the rest of it. Ctrl-C in a session ends all."""
+    ends_s = 60.0 * minutes
+    while soak.elapsed_s() < ends_s:
+        long = soak.elapsed_s() >= 0.5 * ends_s
+        session, clock = Session(), Realtime(tick_hz)
+        devices: list[Any] = []
+        soak.sessions.append(session)
+
+        def observed(device: Any, sinks: Sequence[Any], devices: list[Any] = devices) -> Gauges:
+            devices.append(device)
+            return Gauges(soak, device, sinks, tell)
+
+        try:
+            with played(folder / f"station{len(soak.sessions)}", motion) as profile:
+                done = perform(profile, clock, lambda: soak.elapsed_s() >= ends_s, observed, long)
+            session.outcome, session.losses = str(done["outcome"]), int(done["device"]["losses"])
+        finally:
+            soak.work_ms.extend(clock.work_ms)
+            session.ticks, session.overruns = len(clock.work_ms), int(clock.report()["overruns"])
+            for device in devices:
+                soak.latency.merge(device.latency)
+        if session.outcome == "aborted" and soak.elapsed_s() < ends_s:
+            return
+
+
+def with_rest(text: str, minutes: float) -> str:
+    """A task's text with a last step that is not reached, and time for it."""
+    text = re.sub(r"(?m)^time_limit_s = .*$", f"time_limit_s = {60.0 * minutes + 60.0!r}", text)
+    before, metric, after = text.partition("[[metric]]")
+    return before + REST + metric + after
+
+
+@contextmanager
+def played(folder: Path, motion: str) -> Iterator[Path]:
+    """``trainer devices simulate`` in a process and a process group of its own; its profile. Raises OSError."""
+    command = [sys.executable, "-m", "trainer", "devices", "simulate", PROFILE, "--out", str(folder)]
+    process = subprocess.Popen(
+        [*command, "--motion", motion], stdout=subprocess.PIPE, text=True, start_new_session=True
+    )
+    assert process.stdout is not None
+    try:
+        written = process.stdout.readline().strip()
+        if not written:
+            raise OSError(f"{folder}: the simulated devices do not start")
+        yield Path(written)
+    finally:
+        process.terminate()
+        process.communicate()
+
+
+def rss_mb() -> float:
+    """What this process holds in memory, MB; its most so far where the system tells no more."""
+    statm = Path("/proc/self/statm")
+    if statm.exists():
+        return int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3)
