@@ -5,7 +5,7 @@ scripted expert did. For half of the time the stitch is sewn again and again, a 
 session, in which the hands rest after the stitch. Once a second the gauges are read:
 
 * memory of this process (resident set), its slope by least squares from the end of the first session on, and in the
-  last session;
+  last session after its first twenty seconds;
 * ticks that wait for the log's thread and frames that wait for the recording's; the device has no queue, its newest
   pose wins;
 * drift: ticks by which the session's clock and the device's (its samples, counted at the rate it was asked for) have
@@ -17,6 +17,7 @@ this machine's, so drift is what bytes, threads and pacing make of it, not what 
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import subprocess
@@ -35,6 +36,7 @@ from trainer.drivers.minibird import Minibird
 
 EVERY_S = 1.0  # between two looks at the gauges
 TOLD_EVERY_S = 30.0
+SETTLED = 4  # seconds after which the line through the device's samples stands: two of its windows
 PROFILE = "minibird-pair"
 #: A step that the resting hands never reach: needle and thread are out of every hole again.
 REST = '[[step]]\nname = "rest"\nkind = "withdraw"\n\n'
@@ -71,6 +73,7 @@ class Soak:
     latency: LatencyCount = field(default_factory=LatencyCount)
     work_ms: array[float] = field(default_factory=lambda: array("d"))
     began_s: float = field(default_factory=time.monotonic)
+    told_s: float = field(default_factory=time.monotonic)  # when progress was last told
 
     def elapsed_s(self) -> float:
         return time.monotonic() - self.began_s
@@ -83,11 +86,20 @@ class Gauges:
         self._soak, self._driver, self._tell = soak, driver, tell
         self._queues = {type(sink).__name__: sink for sink in sinks if isinstance(sink, Queued)}
         self._session = soak.sessions[-1]
-        self._due_s = self._told_s = time.monotonic()
+        self._due_s = time.monotonic()
+        self._apart = -math.inf  # session's clock less the device's in this second, ticks: that of the least late tick
+        self._seconds = 0  # since the device's clock began
+        self._line = 0
+        self._at_first = 0.0
 
     def tick(self, record: object) -> None:
         for name, sink in self._queues.items():
             self._session.waiting[name] = max(self._session.waiting.get(name, 0), sink.waiting)
+        if isinstance(self._driver, Minibird):
+            apart, line = self._driver.apart_ticks()
+            if line != self._line:
+                self._line, self._seconds = line, 0
+            self._apart = max(self._apart, apart)
         now = time.monotonic()
         if now < self._due_s:
             return
@@ -96,15 +108,22 @@ class Gauges:
         soak.at_s.append(soak.elapsed_s())
         soak.rss_mb.append(rss_mb())
         soak.session_of.append(len(soak.sessions) - 1)
-        if isinstance(self._driver, Minibird):
-            drift = self._driver.drift_ticks()
-            self._session.drift_ticks = max(self._session.drift_ticks, abs(drift))
-        if now - self._told_s >= TOLD_EVERY_S:
-            self._told_s = now
+        self._drift()
+        if now - soak.told_s >= TOLD_EVERY_S:
+            soak.told_s = now
             self._tell(
                 f"{soak.elapsed_s() / 60.0:5.1f} min, session {len(soak.sessions)}, {soak.rss_mb[-1]:.0f} MB, "
                 f"drift {self._session.drift_ticks:.2f} ticks"
             )
+
+    def _drift(self) -> None:
+        """A second is over: how far have the clocks come apart since the device's was settled?"""
+        apart, self._apart = self._apart, -math.inf
+        self._seconds += 1
+        if self._seconds <= SETTLED:
+            self._at_first = apart
+        elif math.isfinite(apart):
+            self._session.drift_ticks = max(self._session.drift_ticks, abs(apart - self._at_first))
 
     def close(self) -> None:
         """Nothing stays open."""

@@ -15,12 +15,16 @@ from trainer.bench.machine import in_words
 from trainer.bench.soak import Soak
 from trainer.clock import pace
 
+#: Readings at the beginning of a session after which all that it needs is in memory, a second each.
+WARM_S = 20
+
 
 def document(soak: Soak, minutes: float, tick_hz: float, about: dict[str, Any]) -> dict[str, Any]:
     """What ``--json`` prints and ``realtime.json`` holds; numbers of nothing are None."""
     at_s, rss, of = np.array(soak.at_s), np.array(soak.rss_mb), np.array(soak.session_of)
     last = len(soak.sessions) - 1
     warm = of > 0 if last > 0 else of == 0
+    settled = np.flatnonzero(of == last)[WARM_S:]
     waiting: dict[str, int] = {}
     for session in soak.sessions:
         for name, most in session.waiting.items():
@@ -36,7 +40,7 @@ def document(soak: Soak, minutes: float, tick_hz: float, about: dict[str, Any]) 
             "warm": _first(rss[warm]),
             "end": _first(rss[::-1]),
             "slope_per_minute": _slope(at_s[warm] / 60.0, rss[warm]),
-            "slope_per_minute_last_session": _slope(at_s[of == last] / 60.0, rss[of == last]),
+            "slope_per_minute_last_session": _slope(at_s[settled] / 60.0, rss[settled]),
         },
         "waiting_most": waiting,
         "drift_ticks_most": max((s.drift_ticks for s in soak.sessions), default=None),

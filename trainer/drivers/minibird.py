@@ -17,7 +17,7 @@ import numpy as np
 
 from trainer.config import ConfigError
 from trainer.drivers import field_distortion
-from trainer.drivers.clock_line import WINDOW, ClockLine
+from trainer.drivers.clock_line import ClockLine
 from trainer.drivers.closure import ClosureSensor
 from trainer.drivers.latency import LatencyCount
 from trainer.drivers.minibird_flock import UNHURRIED, Silences
@@ -33,8 +33,6 @@ STALE_S = 0.1
 FIRST_S = 0.5
 #: How long a thread computes before it lets one that has read something have a turn; 5 ms by default. Assumed.
 SWITCH_S = 0.0005
-#: Drift is counted from when the device's line has so many samples: its window and the first lost ones are known.
-SETTLED = 2 * WINDOW
 #: As many losses are told one by one; a worse session is told by their number.
 MOST_LOSSES = 100
 MOST_REASONS = 4  # of one loss
@@ -85,8 +83,7 @@ class Minibird:
         self._begun_s: float | None = None
         self._line = ClockLine(1.0 / spec.rate_hz)
         self.latency = LatencyCount()  # from a pose's first byte to its tick's events, of each pose that was used
-        self._apart_s: float | None = None  # device's clock against the session's when both had begun
-        self._line_begun = 0
+        self._polled_s = 0.0  # when this tick began
         self._fresh: list[Sample] = []  # poses that this tick uses and none used before
         self._ticks = 0
         self._losses: list[dict[str, object]] = []
@@ -123,7 +120,7 @@ class Minibird:
         if ahead_s > 0.0:
             time.sleep(ahead_s)
             now = time.monotonic()
-        self._ticks = tick
+        self._ticks, self._polled_s = tick, now
         self._fresh.clear()
         valid = np.asarray(self._home.valid, dtype=bool).copy()
         reasons = [""] * len(valid)
@@ -191,16 +188,14 @@ class Minibird:
             self.latency.add(1e3 * (now - sample.sent_s))
         self._fresh.clear()
 
-    def drift_ticks(self) -> float:
-        """By how many ticks the session's clock has left the device's behind since both began; now, at any tick.
+    def apart_ticks(self) -> tuple[float, int]:
+        """The session's clock when this tick began less the device's, in ticks, and which of its beginnings it is.
 
-        The device's clock counts its samples, lost ones too, at the rate that was asked for; a pause begins it anew.
+        The device's clock counts its samples, lost ones too, at the rate that was asked for; it begins with the stream,
+        and anew after a pause. How far both come apart later is drift; a tick that begins late is not.
         """
-        samples, begun = self._line.read(time.monotonic())
-        apart_s = self._ticks * self._tick_s - samples / self._spec.rate_hz
-        if self._apart_s is None or begun != self._line_begun or samples < SETTLED:
-            self._apart_s, self._line_begun = apart_s, begun
-        return (apart_s - self._apart_s) / self._tick_s
+        samples, begun = self._line.read(self._polled_s)
+        return (self._ticks * self._tick_s - samples / self._spec.rate_hz) / self._tick_s, begun
 
     def summary(self) -> dict[str, object]:
         """What was read, how late, and when and why it was not."""
