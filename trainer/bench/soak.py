@@ -1,4 +1,4 @@
-"""Does a station last? Hours of practice in minutes: sessions through simulated devices, in real time.
+"""Does a station last? Practice through simulated devices, in real time, for as long as asked.
 
 A tracker pair and a closure sensor are played byte for byte on pseudo-terminals by another process, and move as the
 scripted expert did. For half of the time the stitch is sewn again and again, a session each; the second half is one
@@ -36,7 +36,7 @@ from trainer.drivers.minibird import Minibird
 
 EVERY_S = 1.0  # between two looks at the gauges
 TOLD_EVERY_S = 30.0
-SETTLED = 4  # seconds after which the line through the device's samples stands: two of its windows
+SETTLED = 7  # seconds after which the line through the device's samples stands: three of its windows
 PROFILE = "minibird-pair"
 #: A step that the resting hands never reach: needle and thread are out of every hole again.
 REST = '[[step]]\nname = "rest"\nkind = "withdraw"\n\n'
@@ -72,8 +72,8 @@ class Soak:
     session_of: array[int] = field(default_factory=lambda: array("l"))  # in which session
     latency: LatencyCount = field(default_factory=LatencyCount)
     work_ms: array[float] = field(default_factory=lambda: array("d"))
-    began_s: float = field(default_factory=time.monotonic)
-    told_s: float = field(default_factory=time.monotonic)  # when progress was last told
+    began_s: float = field(default_factory=lambda: time.monotonic())
+    told_s: float = field(default_factory=lambda: time.monotonic())  # when progress was last told
 
     def elapsed_s(self) -> float:
         return time.monotonic() - self.began_s

@@ -15,7 +15,12 @@ WINDOW = 206
 FADE = 1.0 - 1.0 / WINDOW
 #: From so many samples on the period is fitted, too.
 ENOUGH = 10
+#: A device keeps the period that was asked for within this share of it, assumed. What a busy machine hands over at once
+#: would seem to have next to none, and all that follow would seem to come after lost ones.
+TRUE_TO = 0.05
 CATCH_UP = 8
+#: Before so many samples nothing counts as lost: what came together at the start has bent the line until then.
+SETTLED = 3 * WINDOW
 #: A sample so many periods after the last begins a new line (pause, power cycle).
 BREAK = 50
 
@@ -57,7 +62,9 @@ class ClockLine:
         self._n += 1.0
         self._newest_s = arrived_s
         if self._seen >= ENOUGH:
-            self.period_s = (self._n * self._it - self._i * self._t) / (self._n * self._ii - self._i * self._i)
+            fitted_s = (self._n * self._it - self._i * self._t) / (self._n * self._ii - self._i * self._i)
+            low_s, high_s = (1.0 - TRUE_TO) * self._nominal_s, (1.0 + TRUE_TO) * self._nominal_s
+            self.period_s = min(max(fitted_s, low_s), high_s)
         self._due_s = arrived_s + (self._t - self.period_s * self._i) / self._n
         self._residual2 += (arrived_s - self._due_s) ** 2
         self._count += 1
@@ -72,8 +79,8 @@ class ClockLine:
     def _lost(self, arrived_s: float) -> int:
         """How many samples are known by now to have been lost."""
         late = (arrived_s - self._due_s) / self.period_s - 1.0
-        self._late = [*self._late, late] if late >= 0.5 else []
-        if len(self._late) < CATCH_UP:
+        self._late = [*self._late[1 - CATCH_UP :], late] if late >= 0.5 else []
+        if len(self._late) < CATCH_UP or self._seen < SETTLED:
             return 0
         lost = round(min(self._late))
         self._late = []
