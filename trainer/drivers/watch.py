@@ -66,10 +66,10 @@ class Watch:
             return
         if sample.address == self._spec.bird[0].address:
             self._due.append(self._line.observe(sample.sent_s))
-            if self._due[-1] - self._due[0] > self._keep_s:
+            while self._due[-1] - self._due[0] > self._keep_s:
                 self._due.popleft()
         kept.append(sample)
-        if sample.arrived_s - kept[0].arrived_s > self._keep_s:
+        while sample.arrived_s - kept[0].arrived_s > self._keep_s:
             kept.popleft()
 
     def samples(self, address: int) -> list[Sample]:
