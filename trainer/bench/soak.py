@@ -9,7 +9,8 @@ session, in which the hands rest after the stitch. Once a second the gauges are 
 * ticks that wait for the log's thread and frames that wait for the recording's; the device has no queue, its newest
   pose wins;
 * drift: ticks by which the session's clock and the device's (its samples, counted at the rate it was asked for) have
-  come apart since both began.
+  come apart since both began. A session on a machine that is too slow for it goes on from where it is, which shows
+  here as well.
 
 A pose's latency is the time from its first byte to its tick's events being out, by the driver. The device's clock is
 this machine's, so drift is what bytes, threads and pacing make of it, not what a tracker's crystal does.
