@@ -159,7 +159,7 @@ def measure(
             soak.work_ms.extend(clock.work_ms)
             session.ticks, session.overruns = len(clock.work_ms), int(clock.report()["overruns"])
             for device in devices:
-                soak.latency.merge(device.latency.count)
+                soak.latency.merge(device.latency)
         if session.outcome == "aborted" and soak.elapsed_s() < ends_s:
             return
 

@@ -17,6 +17,7 @@ from trainer.config import ConfigError
 from trainer.drivers.clock_line import ClockLine
 from trainer.drivers.closure import ClosureSensor
 from trainer.drivers.in_hand import SWITCH_S, Latency, Losses, Pace, Placer
+from trainer.drivers.latency import LatencyCount
 from trainer.drivers.minibird_flock import UNHURRIED, Silences
 from trainer.drivers.minibird_record import Sample
 from trainer.drivers.minibird_stream import FlockStream
@@ -64,7 +65,7 @@ class Minibird:
         self._position, self._quaternion = home.position.copy(), home.quaternion.copy()
         self._jaws = home.closure.copy()
         self._line = ClockLine(1.0 / spec.rate_hz)
-        self.latency = Latency()  # of each pose that was used
+        self._latency = Latency()
         self._losses = Losses(self._pace.tick_s)
         self._tick, self._polled_s = 0, 0.0  # this tick, and when it began
         self._rate_hz = spec.rate_hz
@@ -94,7 +95,7 @@ class Minibird:
         if self._pace.begun_s is None:
             self._stream.start()
         now = self._pace.wait(tick)
-        self.latency.begin()
+        self._latency.begin()
         self._tick, self._polled_s = tick, now
         valid = np.asarray(self._home.valid, dtype=bool).copy()
         reasons = [""] * len(valid)
@@ -125,13 +126,18 @@ class Minibird:
                 self._closure.moved(tool, math.dist(sample.position, instrument.used.position), now)
             self._position[k], self._quaternion[k] = pose.position, pose.quaternion
             instrument.used = sample
-            self.latency.used(sample.sent_s)
+            self._latency.used(sample.sent_s)
         self._jaws[k] = jaws
         return ""
 
     def tick(self, record: object) -> None:
         """The events of a tick are with the sinks: how long did its poses take to become them?"""
-        self.latency.told()
+        self._latency.told()
+
+    @property
+    def latency(self) -> LatencyCount:
+        """From a pose's first byte to its tick's events, of each pose that was used."""
+        return self._latency.count
 
     def apart_ticks(self) -> tuple[float, int]:
         """The session's clock when this tick began less the device's, in ticks, and which of its beginnings it is.
@@ -149,7 +155,7 @@ class Minibird:
             "records": dict(sorted(self._stream.counts.items())),
             "measured_rate_hz": round(1.0 / self._line.period_s, 3),
             "jitter_ms": round(1e3 * self._line.jitter_s, 3),
-            "latency_ms": self.latency.summary(),
+            "latency_ms": self._latency.summary(),
             "restarts": self._stream.restarts,
             **self._losses.summary(),
             "closure": None if self._closure is None else self._closure.summary(),
