@@ -79,6 +79,10 @@ def test_what_is_not_finite_does_not_enter_the_log(number: float) -> None:
         events.payload(events.TrackingBack(1, 0, 0.01, "left", lost_s=number))
 
 
+def test_an_older_log_knows_of_no_reason() -> None:
+    assert events.from_row(7, 0, 0.0, "left", "tracking_lost", "{}") == events.TrackingLost(7, 0, 0.0, "left")
+
+
 def test_an_unknown_kind_and_fields_that_do_not_fit_are_named() -> None:
     with pytest.raises(ValueError, match="unknown kind of event 'sneeze'"):
         events.from_row(1, 0, 0.0, "", "sneeze", "{}")

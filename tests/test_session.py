@@ -13,7 +13,7 @@ from trainer.clock import Fast, Realtime
 from trainer.events import Event, StepDone, TaskDone, TickOverrun
 from trainer.geometry import Array
 from trainer.poses import ToolPoses
-from trainer.session import admit, interruptible, run
+from trainer.session import NO_POSE, admit, interruptible, run
 from trainer.sinks.surface import Frame, TickRecord
 
 NOWHERE = (0.0, 0.0, 0.0)
@@ -222,6 +222,7 @@ def test_what_is_no_pose_is_held_and_counts_as_not_seen(field: str, number: floa
     found = admit(seen, held)
     assert found.valid.tolist() == [True, False]
     assert found.position[:, 0].tolist() == [2.0, 1.0]
+    assert found.reason == ("", NO_POSE)
     for name in ("position", "quaternion", "closure"):
         assert np.isfinite(getattr(found, name)).all()
 

@@ -220,6 +220,7 @@ class TrackingLost(Event):
     """The device no longer sees the instrument, which stays where it was last seen."""
 
     kind = "tracking_lost"
+    reason: str = ""  # as the device knew it at that tick; "" in older logs and where the device does not know
 
 
 @dataclass(frozen=True)

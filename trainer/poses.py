@@ -24,9 +24,15 @@ class ToolPoses:
     quaternion: Array  # (k, 4) wxyz, world_from_tool
     closure: Array  # (k,) 0 open … 1 closed
     valid: np.ndarray  # (k,) bool; False where the device did not see the tool at this tick
+    #: (k,) why not, "" where it did; () from a device that gives no reasons. A packed row does not hold it: the event
+    #: ``tracking_lost`` does, and a replay takes it from there.
+    reason: tuple[str, ...] = ()
 
     def world_from_tool(self, tool: int) -> Rigid:
         return Rigid(self.position[tool], self.quaternion[tool])
+
+    def why_lost(self, tool: int) -> str:
+        return self.reason[tool] if self.reason else ""
 
     def pack(self) -> Array:
         """One row of ``9 k`` float64, as the log stores it."""
@@ -35,6 +41,6 @@ class ToolPoses:
 
     @staticmethod
     def unpack(row: Array) -> ToolPoses:
-        """The inverse of :meth:`pack`. Raises ValueError when the length is no multiple of 9."""
+        """The inverse of :meth:`pack`, without reasons. Raises ValueError when the length is no multiple of 9."""
         a = np.asarray(row, dtype=np.float64).reshape(-1, NUMBERS_PER_TOOL)
         return ToolPoses(a[:, 0:3].copy(), a[:, 3:7].copy(), a[:, 7].copy(), a[:, 8] != 0.0)

@@ -12,7 +12,6 @@ from itertools import zip_longest
 from trainer import curriculum, scene
 from trainer.events import Event, TaskDone, payload
 from trainer.log.record import TOLERANCE, SessionRecord
-from trainer.poses import ToolPoses
 
 
 def resimulate(record: SessionRecord, rows: Iterable[int] | None = None) -> list[Event]:
@@ -27,9 +26,7 @@ def resimulate(record: SessionRecord, rows: Iterable[int] | None = None) -> list
     running = scene.build(curriculum.parse_task(header.task_toml, header.task), **chosen)
     found: list[Event] = []
     for i in range(record.ticks) if rows is None else rows:
-        found += running.step(
-            ToolPoses(record.position[i], record.quaternion[i], record.closure[i], record.valid[i]),
-        )
+        found += running.step(record.poses(i))
         if running.outcome:
             return found
     done = next((e for e in record.events if isinstance(e, TaskDone)), None)

@@ -168,7 +168,7 @@ class Scene:
                     world.emit(TrackingBack, time_s, self.tools[i], lost_s=time_s - jaw.lost_at)
                 else:
                     jaw.lost_at = time_s
-                    world.emit(TrackingLost, time_s, self.tools[i])
+                    world.emit(TrackingLost, time_s, self.tools[i], reason=poses.why_lost(i))
             targets.append(world.scene_from_world @ poses.world_from_tool(i) if seen else jaw.pose)
             closures[i] = poses.closure[i] if seen else jaw.closure
         return targets, closures

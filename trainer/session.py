@@ -17,6 +17,9 @@ from trainer.events import Event, TickOverrun
 from trainer.poses import ToolPoses
 from trainer.sinks.surface import Frame, Sink, TickRecord
 
+#: Why an instrument counts as not seen whose numbers cannot be taken.
+NO_POSE = "its numbers are no pose"
+
 
 class Scene(Protocol):
     """What the loop needs of :class:`trainer.scene.Scene`."""
@@ -89,6 +92,7 @@ def admit(seen: ToolPoses, held: ToolPoses) -> ToolPoses:
         quaternion=np.where(pose[:, None], seen.quaternion, held.quaternion),
         closure=np.clip(np.where(pose, seen.closure, held.closure), 0.0, 1.0),
         valid=seen.valid & pose,
+        reason=tuple(seen.why_lost(i) or ("" if is_pose else NO_POSE) for i, is_pose in enumerate(pose)),
     )
 
 

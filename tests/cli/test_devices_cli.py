@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from typer.testing import CliRunner
 
+from trainer import serial_ports
 from trainer.cli.devices import app
 from trainer.profile import profile_names
 
@@ -37,11 +39,38 @@ runner = CliRunner()
 def test_list_names_every_shipped_profile() -> None:
     got = runner.invoke(app, ["list", "--json"])
     assert got.exit_code == 0
-    rows = json.loads(got.stdout)
+    rows = json.loads(got.stdout)["profiles"]
     assert [row["name"] for row in rows] == profile_names()
     assert all(row["summary"] and row["driver"] for row in rows)
-    table = runner.invoke(app, ["list"]).stdout.splitlines()
+    table = runner.invoke(app, ["list"]).stdout.partition("\n\n")[0].splitlines()
     assert [line.split()[0] for line in table] == profile_names()
+
+
+@pytest.mark.parametrize(
+    ("vendor", "description", "fits", "what"),
+    [
+        (0x0403, "n/a", "minibird-pair: [minibird]", "FTDI adapter"),
+        (0x2341, "Arduino Uno", "minibird-pair: [closure]", "Arduino Uno"),
+        (0x1A86, None, "minibird-pair: [closure]", "CH340 of a board"),
+        (None, "n/a", "minibird-pair: [minibird]", "serial port"),
+        (0x9999, "Thing", "minibird-pair: [minibird] or [closure]", "Thing"),
+    ],
+)
+def test_list_says_which_profile_fits_a_port(
+    monkeypatch: pytest.MonkeyPatch, vendor: int | None, description: str | None, fits: str, what: str
+) -> None:
+    found = [SimpleNamespace(device=f"/dev/tty{k}", vid=vendor, description=description) for k in (1, 0)]
+    monkeypatch.setattr(serial_ports.list_ports, "comports", lambda: found)
+    ports = json.loads(runner.invoke(app, ["list", "--json"]).stdout)["ports"]
+    assert ports == [{"port": f"/dev/tty{k}", "what": what, "fits": fits} for k in (0, 1)]
+    for word in ("/dev/tty0", fits, what):
+        assert word in runner.invoke(app, ["list"]).stdout.partition("\n\n")[2]
+
+
+def test_no_port_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(serial_ports.list_ports, "comports", list)
+    below = runner.invoke(app, ["list"]).stdout.partition("\n\n")[2]
+    assert below == "no serial port; plug a device in, or give its profile an address such as socket://host:port\n"
 
 
 @pytest.mark.parametrize("name", profile_names())

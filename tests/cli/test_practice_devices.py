@@ -6,16 +6,27 @@ import json
 import os
 import re
 import signal
-import subprocess
-import sys
+import sqlite3
+import threading
+import time
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 from conftest import CommandLine
-from simulated_devices import simulated
+from simulated_devices import SHORT, simulated
 
 from trainer import curriculum
+from trainer.drivers.minibird import Minibird
+from trainer.drivers.minibird_flock import UNHURRIED
+
+
+@pytest.fixture(autouse=True)
+def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Simulated units need no reset, only their silence before they configure themselves."""
+    monkeypatch.setattr(Minibird.__init__, "__defaults__", (replace(SHORT, configure_s=UNHURRIED.configure_s),))
 
 
 @pytest.fixture
@@ -80,52 +91,42 @@ def test_a_lost_tracker_freezes_the_needle_in_its_jaws_and_ctrl_c_keeps_all(
         # Jaws that the board says are open would let go of the needle, and that is not what is asked here.
         text = profile.read_text().partition("[closure]")[0]
         profile.write_text(text)
-        command = [
-            sys.executable,
-            "-m",
-            "trainer",
-            "practice",
-            str(task),
-            "--device",
-            str(profile),
-            "--no-record",
-            "--json",
-        ]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ)
-        try:
-            wait_until_back(own_log, process)
-            process.send_signal(signal.SIGINT)
-            out, err = process.communicate(timeout=60)
-        finally:
-            process.kill()
-    assert process.returncode == 0, err
+        presses = threading.Thread(target=ctrl_c_when_back, args=(own_log,), daemon=True)
+        presses.start()
+        code, out, err = command_line("practice", task, "--device", profile, "--no-record", "--json")
+        presses.join()
+    assert code == 0, err
     result = json.loads(out)
     assert result["outcome"] == "aborted"
     assert result["events"]["tracking_lost"] >= 2
     assert "release" not in result["events"]
     assert any("gone" in loss["reason"] for loss in result["device"]["lost"])
+    shown = json.loads(command_line("sessions", "show", "last", "--events", "--json")[1])
+    assert "the port is gone" in [e["reason"] for e in shown["event_list"] if e["kind"] == "tracking_lost"]
     assert command_line("db", "check")[0] == 0
+    # The reason is an input: simulated again, the same events say the same.
+    code, _, err = command_line("sessions", "replay", "last", "--verify")
+    assert code == 0, err
 
 
-def wait_until_back(log: Path, process: subprocess.Popen[str]) -> None:
-    """Until the log holds an instrument that was lost and is back."""
-    import sqlite3
-    import time
-
+def ctrl_c_when_back(log: Path) -> None:
+    """Press it when the log holds two instruments that were lost and are back."""
     ends = time.monotonic() + 60.0
-    while time.monotonic() < ends and process.poll() is None:
-        time.sleep(0.1)
-        if not log.exists():
-            continue
-        with sqlite3.connect(f"file:{log}?mode=ro", uri=True) as db:
-            try:
-                found = db.execute("select count(*) from events where kind = 'tracking_back'").fetchone()[0]
-            except sqlite3.OperationalError:
-                continue
-        db.close()
-        if found >= 2:
+    while time.monotonic() < ends:
+        if backs(log) >= 2:
+            os.kill(os.getpid(), signal.SIGINT)
             return
-    raise AssertionError("no instrument came back")
+        time.sleep(0.05)
+
+
+def backs(log: Path) -> int:
+    if not log.exists():
+        return 0
+    with closing(sqlite3.connect(f"file:{log}?mode=ro", uri=True)) as db:
+        try:
+            return int(db.execute("select count(*) from events where kind = 'tracking_back'").fetchone()[0])
+        except sqlite3.OperationalError:
+            return 0
 
 
 def test_a_device_that_is_not_there_is_one_line_and_no_session(

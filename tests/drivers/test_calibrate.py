@@ -13,7 +13,7 @@ from tests.drivers.test_pivot import cone
 from tests.drivers.test_touched_points import PHANTOM
 from trainer.calibration import Calibration, CalibrationError, path_for, write
 from trainer.config import ConfigError
-from trainer.drivers.calibrate import Readings, Sweep, calibrate, from_files, read_readings, sensor_of
+from trainer.drivers.calibrate import Readings, Sweep, calibrate, read_places, read_readings, read_sweep, sensor_of
 from trainer.drivers.recording import map_poses
 from trainer.geometry import Array, Rigid, matrix_from_quaternion, quaternion_from_axis_angle
 from trainer.profile import Profile, RecordingSpec, Sensor, load_profile
@@ -162,8 +162,11 @@ def test_files_give_what_arrays_give(tmp_path: Path) -> None:
     points, swept = touch(PHANTOM, rng), sweep(rng)
     (tmp_path / "points.csv").write_text(table(points, oriented=True))
     (tmp_path / "sweep.csv").write_text(recorded(swept))
-    got = from_files(PROFILE, DATE, None, tmp_path / "points.csv", tmp_path / "sweep.csv", None)
-    assert got == calibrate(PROFILE, ONE, DATE, points, swept, None)
+    read = read_readings(tmp_path / "points.csv"), read_sweep(tmp_path / "sweep.csv", ONE.name)
+    assert calibrate(PROFILE, ONE, DATE, *read, None) == calibrate(PROFILE, ONE, DATE, points, swept, None)
+    assert read_places(tmp_path / "points.csv") is None
+    (tmp_path / "places.csv").write_text("scene_x_mm,scene_y_mm,scene_z_mm\n1,2,3\n4,5,6\n")
+    np.testing.assert_array_equal(read_places(tmp_path / "places.csv"), [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
 
 
 def test_readings_without_orientation_are_of_the_tip_itself(tmp_path: Path) -> None:

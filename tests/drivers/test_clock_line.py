@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from trainer.drivers.clock_line import BREAK, ClockLine
+from trainer.drivers.clock_line import BREAK, ENOUGH, ClockLine
 
 
 def test_even_samples_lie_on_their_line() -> None:
-    """Time t0 + k T with T 3 % off what was asked for: from the tenth sample on the line is exact.
+    """Time t0 + k T with T 3 % off what was asked for: when there are enough samples the line is exact.
 
     Sums relative to the newest sample hold numbers below 206² T = 420 s; rounding 1e-13 of that in each of a dozen
     operations, divided by sums of the same kind, stays below 1e-9 s.
@@ -17,18 +17,33 @@ def test_even_samples_lie_on_their_line() -> None:
     line = ClockLine(1 / 103)
     period = 1 / 100
     due = [line.observe(5000.0 + k * period) for k in range(1000)]
-    np.testing.assert_allclose(due[9:], 5000.0 + period * np.arange(9, 1000), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(due[ENOUGH - 1 :], 5000.0 + period * np.arange(ENOUGH - 1, 1000), rtol=0, atol=1e-9)
     assert line.period_s == pytest.approx(period, abs=1e-9)
+    now_s = 5000.0 + 999.5 * period
+    assert line.read(now_s) == (pytest.approx(999.5, abs=1e-6), 1)
+
+
+def test_samples_that_come_together_at_the_start_are_none_lost() -> None:
+    """Thirty that a busy machine hands over at once, then each in its time, at the period that was asked for: the line
+    begins up to 30 periods late, and its count is the samples' own, plus or minus the fraction that has gone by."""
+    line = ClockLine(0.01)
+    for _ in range(30):
+        line.observe(10.3)
+    for k in range(30, 2000):
+        line.observe(10.0 + 0.01 * (k + 1))
+    assert line.read(10.0 + 0.01 * 2000)[0] == pytest.approx(1999, abs=1.0)
 
 
 def test_lost_samples_are_counted_when_none_catches_up() -> None:
-    """Of every 200 samples 1 to 5 are lost. For 7 samples the index is m <= 5 too low; with fading weights (N = 206)
+    """Of every 200 samples 1 to 5 are lost, when the line has settled.
+
+    For 7 samples the index is m <= 5 too low; with fading weights (N = 206)
     that bends the slope by at most 7 m / (2 N²) = 4e-4 of a period for each loss, of which two or three are remembered,
     and moves the newest end by at most 7 m · 4 / (2 N) = 0.34 periods for each: together less than 1 % and a period."""
     rng = np.random.default_rng(2)
     line = ClockLine(1 / 103)
     steps = np.ones(4000, dtype=int)
-    steps[200::200] += rng.integers(1, 6, len(steps[200::200]))
+    steps[800::200] += rng.integers(1, 6, len(steps[800::200]))
     index = np.cumsum(steps)
     due = np.array([line.observe(10.0 + k / 103) for k in index.tolist()])
     known = np.arange(4000) % 200 > 20  # when the last loss has been counted

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from trainer.config import ConfigError
 from trainer.curriculum import Task, load_task
 from trainer.drivers import open_driver
+from trainer.events import Event, TrackingLost
 from trainer.log.record import SessionHeader
 from trainer.log.schema import LogError
 from trainer.poses import ToolPoses
@@ -17,6 +19,8 @@ from trainer.sinks.log import LogSink
 from trainer.sinks.surface import Frame, TickRecord
 
 ROWS = 60
+Events = Mapping[int, tuple[Event, ...]]  # by tick
+NONE: Events = {}
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +42,9 @@ def no_frame() -> Frame:
     raise AssertionError("the log needs no frame")
 
 
-def log(path: Path, rows: list[ToolPoses], tools: tuple[str, ...], tick_hz: float, ticks: int) -> str:
+def log(
+    path: Path, rows: list[ToolPoses], tools: tuple[str, ...], tick_hz: float, ticks: int, events: Events = NONE
+) -> str:
     header = SessionHeader(
         id="20250101-000000-abcd", trainee="A", task="t", task_toml="", task_sha256="", device="d", device_toml="",
         device_sha256="", seed=0, tick_hz=tick_hz, tools=tools, started_at="2025-01-01T00:00:00Z", versions={},
@@ -46,7 +52,7 @@ def log(path: Path, rows: list[ToolPoses], tools: tuple[str, ...], tick_hz: floa
     )  # fmt: skip
     sink = LogSink(path, header)
     for tick, poses in enumerate(rows):
-        sink.tick(TickRecord(tick, tick / tick_hz, poses, (), no_frame))
+        sink.tick(TickRecord(tick, tick / tick_hz, poses, events.get(tick, ()), no_frame))
     sink.finish("failed", "the input ended", ticks, ticks / tick_hz, None, None, ())
     sink.close()
     return f"{path}#{header.id}"
@@ -67,6 +73,19 @@ def test_stored_rows_come_back_bit_for_bit_by_instrument(
             assert np.array_equal(getattr(got, name), getattr(wanted, name)[columns])
     assert driver.poll(ROWS, None) is None
     assert driver.summary()["frames_consumed"] == ROWS
+
+
+def test_a_lost_instrument_is_lost_for_the_same_reason(tmp_path: Path, task: Task, stored: list[ToolPoses]) -> None:
+    """The reason is an input that the log keeps in the event: played or simulated again, it is there."""
+    tools = ("right", "left")
+    lost = TrackingLost(2, 0, 0.02, "left", reason="the port is gone")
+    reference = log(tmp_path / "s.db", stored, tools, task.tick_hz, ROWS, {2: (lost,)})
+    _, driver = open_driver(reference, task, stored[0], seed=0)
+    reasons = {tick: poses.reason for tick in range(ROWS) if (poses := driver.poll(tick, None)) is not None}
+    left = [instrument.tool for instrument in task.scene.instrument].index("left")
+    wanted = ["", ""]
+    wanted[left] = "the port is gone"
+    assert reasons == {tick: tuple(wanted) if tick == 2 else ("", "") for tick in range(ROWS)}
 
 
 def test_a_closing_row_that_was_never_stepped_is_not_played(

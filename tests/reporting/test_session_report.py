@@ -125,6 +125,16 @@ def test_a_trackers_thousand_losses_are_one_line_for_each_hand() -> None:
     assert event_lines(once)[0].text == "not seen by the device for 0.20 s, then lost again"
 
 
+def test_why_an_instrument_was_lost_is_told_the_most_frequent_first() -> None:
+    reasons = ["b", "a", "", "a", "c", "d"]
+    lost = [TrackingLost(**at(10 * i), reason=reason) for i, reason in enumerate(reasons)]
+    back = TrackingBack(**at(60), lost_s=0.5)
+    assert wording.describe(lost[0]) == event_lines((lost[0],))[0].text == "not seen by the device: b"
+    assert wording.unseen(lost[1:4]) == "not seen by the device: a"
+    assert wording.unseen([*lost[:2], back]) == "not seen by the device for 0.50 s: b; a"
+    assert wording.unseen(lost) == "not seen by the device: a; b; c; and others"
+
+
 @pytest.mark.parametrize(("angle", "said"), [(0.0, "0°"), (359.4, "359°"), (359.6, "0°"), (29.6, "30°")])
 def test_twelve_is_never_360_degrees(angle: float, said: str) -> None:
     assert wording.clock(angle) == said

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,6 +14,8 @@ from trainer.cli.sessions import JsonOption
 
 if TYPE_CHECKING:
     from trainer.bench.realtime import Perform
+    from trainer.bench.soak import Observed
+    from trainer.bench.soak import Perform as Practised
     from trainer.clock import Realtime
     from trainer.curriculum import TaskFile
 
@@ -165,6 +168,93 @@ def stability(
     typer.echo(f"written: {written}", err=True)
     if hard.counts(outcomes)["BROKEN"]:
         raise typer.Exit(1)
+
+
+@app.command()
+def soak(
+    minutes: Annotated[float, typer.Option(min=0.01, help="How long.")] = 30.0,
+    quick: Annotated[bool, typer.Option("--quick", help="One minute.")] = False,
+    task: Annotated[str, typer.Option(metavar="FAMILY/TASK", help="What to practise.")] = "anastomosis/single-stitch",
+    out: OutOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Practise through simulated trackers for long: memory, queues, latency, drift; writes realtime.md and .json."""
+    from tempfile import TemporaryDirectory
+
+    from trainer.bench import soak as station
+    from trainer.bench import soak_page as page
+    from trainer.bench.machine import load
+    from trainer.curriculum import load_task
+
+    task_file, minutes = load_task(task), 1.0 if quick else minutes
+    hz = task_file.task.tick_hz
+    about = _machine()
+    with TemporaryDirectory(prefix="trainer-bench-") as name:
+        folder = Path(name)
+        found = station.Soak()
+        try:
+            motion = _stitched(task_file, folder)
+            found = station.Soak()
+            station.measure(found, _practised(task_file, folder, minutes), folder, motion, hz, minutes, _tell)
+        except KeyboardInterrupt:
+            _tell("stopped; this is what was measured")
+    about["load_after"] = load()
+    result = page.document(found, minutes, hz, about)
+    written = page.write(_folder(out, quick), result, quick)
+    if as_json:
+        print(json.dumps(result, indent=2, allow_nan=False))
+    else:
+        for what, value in page.rows(result):
+            print(f"{what:<17} {value}")
+    for path in written:
+        typer.echo(f"written: {path}", err=True)
+
+
+def _tell(line: str) -> None:
+    typer.echo(f"trainer: {line}", err=True)
+
+
+def _stitched(task_file: TaskFile, folder: Path) -> str:
+    """The scripted expert performs the task once, without pauses; what ``devices simulate --motion`` takes."""
+    from contextlib import ExitStack
+
+    from trainer.cli.practice import perform
+    from trainer.clock import Fast
+    from trainer.log.schema import new_session_id
+
+    log_path, session_id = folder / "motion.db", new_session_id()
+    with ExitStack() as stack:
+        clock = Fast(task_file.task.tick_hz)
+        perform(stack, task_file, session_id, "bench", "scripted-expert", 0, clock, log_path, None)
+    return f"{log_path}#{session_id}"
+
+
+def _practised(task_file: TaskFile, folder: Path, minutes: float) -> Practised:
+    """Performs the task by a device, log and recording included; a recording is removed with its session's end."""
+    from contextlib import ExitStack
+
+    from trainer.bench.soak import with_rest
+    from trainer.cli.practice import perform
+    from trainer.curriculum import parse_task
+    from trainer.log.schema import new_session_id
+
+    text = with_rest(task_file.text, minutes)
+    resting = replace(task_file, text=text, task=parse_task(text, task_file.path))
+
+    def session(
+        profile: Path, clock: Realtime, enough: Callable[[], bool], observed: Observed, long: bool
+    ) -> dict[str, Any]:
+        session_id = new_session_id()
+        recording = folder / f"{session_id}.rrd"
+        with ExitStack() as stack:
+            done = perform(
+                stack, resting if long else task_file, session_id, "bench", str(profile), 0, clock,
+                folder / "log.db", recording, enough, observed,
+            )  # fmt: skip
+        recording.unlink()
+        return done
+
+    return session
 
 
 def _session(task_file: TaskFile, folder: Path) -> Perform:

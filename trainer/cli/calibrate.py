@@ -1,25 +1,38 @@
-"""What ``trainer devices calibrate`` does: files in, a dated calibration beside the profile and its residuals out."""
+"""What ``trainer devices calibrate`` does: files or a live device in, a dated calibration and its residuals out."""
 
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import typer
 
+if TYPE_CHECKING:
+    from trainer.drivers.calibrate import Readings, Sweep
+    from trainer.drivers.watch import Watch
+    from trainer.geometry import Array
+    from trainer.profile import Profile, Sensor
 
-def calibrate_from_files(
+LIVE = Path("live")
+SWEEP_S = 15.0  # how long a live sweep lasts
+
+
+def calibrate(
     reference: str, points: Path | None, sweep: Path | None, grid: Path | None, sensor: str | None, as_json: bool
 ) -> None:
     """Fit, write, tell. Raises ConfigError, CalibrationError."""
     from trainer import calibration
-    from trainer.drivers.calibrate import from_files
+    from trainer.drivers import calibrate as fits
     from trainer.profile import load_profile, profile_path
 
     profile = load_profile(reference).profile
-    found = from_files(profile, datetime.now(UTC).isoformat(timespec="seconds"), sensor, points, sweep, grid)
+    chosen = fits.sensor_of(profile, sensor)
+    measured = _measured(profile, chosen, points, sweep, grid)
+    found = fits.calibrate(profile, chosen, datetime.now(UTC).isoformat(timespec="seconds"), *measured)
     path = calibration.path_for(profile_path(reference), found)
     calibration.write(path, found)
     if profile.calibrated_by != "newest":
@@ -40,3 +53,70 @@ def calibrate_from_files(
     if points is not None and found.scene is not None:
         print(f"scene: {found.scene.points} points\n  residual {found.scene.residual_mm:.3f} mm")
     print(path)
+
+
+def _measured(
+    profile: Profile, sensor: Sensor, points: Path | None, sweep: Path | None, grid: Path | None
+) -> tuple[Readings | None, Sweep | None, Readings | None]:
+    """Readings at points, a sweep, and readings on a grid: from their files, or taken now from the device."""
+    from contextlib import ExitStack
+
+    from trainer.drivers import calibrate as fits
+    from trainer.drivers.watch import Watch
+
+    to_touch, to_take = (None if path is None else fits.read_places(path) for path in (points, grid))
+    with ExitStack() as stack:
+        device = None
+        if to_touch is not None or to_take is not None or sweep == LIVE:
+            device = stack.enter_context(Watch(profile, SWEEP_S))
+        place = None
+        if grid is not None:
+            place = fits.read_readings(grid) if to_take is None else _touched(device, sensor, to_take)
+        turned = None
+        if sweep is not None:
+            turned = fits.read_sweep(sweep, sensor.name) if sweep != LIVE else _swept(device, sensor)
+        touched = None
+        if points is not None:
+            touched = fits.read_readings(points) if to_touch is None else _touched(device, sensor, to_touch)
+    return touched, turned, place
+
+
+def _touched(device: Watch | None, sensor: Sensor, places: Array) -> Readings:
+    """The device's readings at each of ``places`` (n, 3) mm, one after the other, as somebody gets there."""
+    import numpy as np
+
+    from trainer.calibration import CalibrationError
+    from trainer.drivers.calibrate import Readings
+
+    assert device is not None
+    position: list[Array] = []
+    quaternion: list[Array] = []
+    for k, place in enumerate(places.tolist(), 1):
+        where = ", ".join(f"{v:g}" for v in place)
+        while len(position) < k:
+            _wait_for(f"{k} of {len(places)}: {sensor.name} to ({where}) mm, hold it still, then Enter")
+            try:
+                p, q = device.touch(int(sensor.name.removeprefix("bird")))
+            except CalibrationError as error:
+                typer.echo(f"trainer: {error}; again", err=True)
+                continue
+            position.append(p)
+            quaternion.append(q)
+    return Readings(np.array(position), np.array(quaternion), places)
+
+
+def _swept(device: Watch | None, sensor: Sensor) -> Sweep:
+    from trainer.drivers.calibrate import Sweep
+
+    assert device is not None
+    _wait_for(f"tip of {sensor.name} into its dimple; Enter, then tilt it to every side for {SWEEP_S:g} s")
+    return Sweep(*device.poses(int(sensor.name.removeprefix("bird")), SWEEP_S))
+
+
+def _wait_for(what: str) -> None:
+    """Until Enter. Raises CalibrationError where nobody is there to press it."""
+    from trainer.calibration import CalibrationError
+
+    typer.echo(what, err=True)
+    if not sys.stdin.readline():
+        raise CalibrationError("the input ended before all was measured; nothing is kept")

@@ -15,16 +15,24 @@ JsonOption = Annotated[bool, typer.Option("--json", help="One JSON document on s
 
 @app.command("list")
 def list_(as_json: JsonOption = False) -> None:
-    """List the shipped device profiles."""
-    from trainer import profile
+    """List the shipped device profiles, and the serial ports of this machine with the profile that fits each."""
+    from dataclasses import asdict
+
+    from trainer import profile, serial_ports
 
     found = [profile.load_profile(name).profile for name in profile.profile_names()]
     rows = [{"name": p.name, "driver": p.driver, "summary": p.summary} for p in found]
+    here = serial_ports.found()
     if as_json:
-        print(json.dumps(rows, indent=2))
+        print(json.dumps({"profiles": rows, "ports": [asdict(port) for port in here]}, indent=2))
         return
     for row in rows:
         print(f"{row['name']:<18} {row['driver']:<10} {row['summary']}")
+    print()
+    for port in here:
+        print(f"{port.port:<18} {port.fits:<35} {port.what}")
+    if not here:
+        print("no serial port; plug a device in, or give its profile an address such as socket://host:port")
 
 
 @app.command()
@@ -167,16 +175,22 @@ def _print_recording(recording: dict[str, Any]) -> None:
 @app.command()
 def calibrate(
     profile: Annotated[str, typer.Argument(metavar="PROFILE", help="A profile's .toml file, or its name.")],
-    points: Annotated[Path | None, typer.Option(metavar="FILE", help="CSV: readings at known points.")] = None,
-    sweep: Annotated[Path | None, typer.Option(metavar="FILE", help="Recording: the tool turns on its tip.")] = None,
-    grid: Annotated[Path | None, typer.Option(metavar="FILE", help="CSV: readings all over the field.")] = None,
+    points: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="CSV: readings at known points, or the points to touch now.")
+    ] = None,
+    sweep: Annotated[
+        Path | None, typer.Option(metavar="FILE|live", help="The tool turns on its tip: a recording, or now.")
+    ] = None,
+    grid: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="CSV: readings all over the field, or the places to take now.")
+    ] = None,
     sensor: Annotated[str | None, typer.Option(metavar="NAME", help="The sensor, where there are several.")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Fit where the scene is, where the tip is, how the field is bent; keep it in a dated file beside the profile."""
-    from trainer.cli.calibrate import calibrate_from_files
+    from trainer.cli.calibrate import calibrate as fit_and_keep
 
-    calibrate_from_files(profile, points, sweep, grid, sensor, as_json)
+    fit_and_keep(profile, points, sweep, grid, sensor, as_json)
 
 
 @app.command()
@@ -186,6 +200,6 @@ def monitor(
     as_json: JsonOption = False,
 ) -> None:
     """Show how the device's records arrive: rate, jitter, loss, poses, closure and the age of the calibration."""
-    from trainer.cli.monitor import show_recording
+    from trainer.cli.monitor import show
 
-    show_recording(profile, seconds, as_json)
+    show(profile, seconds, as_json)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from trainer.drivers.watch import Watch
     from trainer.motion import Motion
     from trainer.profile import Profile, RecordingSpec
 
@@ -18,10 +19,11 @@ REDRAWN_EVERY_S = 0.25
 WINDOW_S = 2.0  # what the live table is about: the last seconds
 
 
-def show_recording(reference: str, seconds: float | None, as_json: bool) -> None:
-    """Play a recording at its own pace and show how its records arrive; ``--json`` does not wait for them.
+def show(reference: str, seconds: float | None, as_json: bool) -> None:
+    """Show how records arrive: of a live device until ``seconds`` are over or Ctrl-C, of a recording at its own pace.
 
-    Raises ConfigError for a device that plays no recording.
+    ``--json`` waits for a live device only. Raises ConfigError for a device that neither has records nor plays a
+    recording, DeviceError for one that does not answer.
     """
     from trainer import drivers
     from trainer.config import ConfigError
@@ -30,6 +32,9 @@ def show_recording(reference: str, seconds: float | None, as_json: bool) -> None
 
     file = drivers.open_profile(reference)
     profile, spec = file.profile, file.profile.recording
+    if profile.driver == "minibird":
+        _watch(profile, seconds, as_json)
+        return
     if spec is None or profile.driver != "recording" or drivers.is_logged(drivers.recording_path(file)):
         raise ConfigError(f"device '{profile.name}' receives no records, so there is nothing to monitor")
     motion = read(drivers.recording_path(file))
@@ -56,12 +61,51 @@ def measured(motion: Motion, profile: Profile, spec: RecordingSpec, start_s: flo
         closure = recorded_closure(track, sensor)
         found = seen(track.position[part], track.ok[part], None if closure is None else closure[part])
         sensors[sensor.name] = {"tool": sensor.tool, **asdict(found)}
-    used = profile.calibration
     return {
         "device": profile.name,
-        "calibration": None if used is None else {"date": used.date, "age_s": used.age_s(datetime.now(UTC))},
+        "calibration": _calibration(profile),
         **asdict(arrival(motion.time[part], motion.frame_number[part])),
         "sensors": sensors,
+    }
+
+
+def _calibration(profile: Profile) -> dict[str, Any] | None:
+    used = profile.calibration
+    return None if used is None else {"date": used.date, "age_s": used.age_s(datetime.now(UTC))}
+
+
+def _watch(profile: Profile, seconds: float | None, as_json: bool) -> None:
+    """Look at a live device. The last word is about all ``seconds``; without them about the last two."""
+    from rich.console import Console
+    from rich.live import Live
+
+    from trainer.drivers.watch import Watch
+    from trainer.session import interruptible
+
+    console = Console(stderr=as_json)
+    with Watch(profile, WINDOW_S if seconds is None else seconds) as device, interruptible() as interrupted:
+        ends = float("inf") if seconds is None else time.monotonic() + seconds
+        with Live(console=console, auto_refresh=False, transient=True) as live:
+            while not interrupted() and (left := ends - time.monotonic()) > 0.0:
+                time.sleep(min(REDRAWN_EVERY_S, left))
+                if console.is_terminal:
+                    live.update(_table(_seen_live(profile, device)), refresh=True)
+        report = _seen_live(profile, device)
+    if as_json:
+        print(json.dumps(report, indent=2))
+    else:
+        Console().print(_table(report))
+
+
+def _seen_live(profile: Profile, device: Watch) -> dict[str, Any]:
+    """As :func:`measured`, and what is wrong now and was with records so far."""
+    return {
+        "device": profile.name,
+        "calibration": _calibration(profile),
+        **asdict(device.arrival()),
+        "sensors": {name: {"tool": tool, **asdict(found)} for name, (tool, found) in device.seen().items()},
+        "flaws": device.flaws,
+        "trouble": device.trouble,
     }
 
 
@@ -88,6 +132,8 @@ def _table(report: dict[str, Any]) -> Table:
     pace = f"{_text(report['rate_hz'], 1)} Hz, jitter {_text(report['jitter_ms'], 2)} ms"
     lost = f"lost {report['lost']} ({_text(report['loss_percent'], 1)} %)"
     caption = f"{pace}, longest {_text(report['interval_max_ms'], 1)} ms, {lost}\n{calibrated}"
+    if report.get("trouble"):
+        caption += f"\n{report['trouble']}"
     table = Table(title=report["device"], caption=caption)
     table.add_column("sensor")
     for column in ("seen %", "x mm", "y mm", "z mm", "closure"):

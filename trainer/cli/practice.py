@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import asdict
 from pathlib import Path
@@ -16,8 +16,10 @@ if TYPE_CHECKING:
     from trainer.choice import Choice
     from trainer.clock import Fast
     from trainer.curriculum import TaskFile
+    from trainer.drivers.driver import Driver
     from trainer.log.record import SessionHeader
     from trainer.profile import ProfileFile
+    from trainer.sinks.surface import Sink
 
 
 def practice(
@@ -76,10 +78,12 @@ def perform(
     log_path: Path,
     recording_path: Path | None,
     enough: Callable[[], bool] = lambda: False,
+    observed: Callable[[Driver, Sequence[Sink]], Sink] | None = None,
 ) -> dict[str, Any]:
     """Run one exercise and store it; the document that ``--json`` prints. ``stack`` closes what was opened.
 
     ``clock`` is a fresh one at the task's rate. ``enough``, asked once in each tick, ends the session like Ctrl-C.
+    ``observed`` is given the device and the sinks and makes one more sink, which may look at them.
     Whatever can be refused is refused before the session enters the log. Raises ConfigError for a task or
     device that cannot be used, LogError and RecordingError where they cannot be written.
     """
@@ -94,7 +98,6 @@ def perform(
     from trainer.sinks.igtlink import IgtlinkSink
     from trainer.sinks.log import LogSink
     from trainer.sinks.recording import RecordingSink
-    from trainer.sinks.surface import Sink
 
     task = task_file.task
     check_targets(task)
@@ -119,7 +122,9 @@ def perform(
         sinks.append(stack.enter_context(closing(IgtlinkSink(published.host, published.port, scene.tools))))
     log = stack.enter_context(closing(LogSink(log_path, header)))
     with closing(Progress(task)) as progress, interruptible() as interrupted, old_objects_left_alone():
-        told = [driver] if isinstance(driver, LiveDriver) else []
+        told: list[Sink] = [driver] if isinstance(driver, LiveDriver) else []
+        if observed is not None:
+            told.append(observed(driver, [log, *sinks]))
         run(scene, driver, [log, *sinks, progress, *told], clock, lambda: interrupted() or enough())
     duration_s = scene.tick / task.tick_hz
     stored = log.record(scene.outcome, scene.tick, duration_s)

@@ -4,7 +4,7 @@ What is fitted first is in effect for what comes after: the field's distortion, 
 What was not measured anew is kept from the calibration in use; a new grid keeps nothing, since the rest was measured in
 the field as it was.
 
-The readings may come from files (:func:`from_files`) or be collected from a live device (:func:`calibrate`).
+The readings come from files, or from a live device (:mod:`trainer.drivers.watch`).
 """
 
 from __future__ import annotations
@@ -44,11 +44,29 @@ class Sweep:
     quaternion: Array  # (n, 4)
 
 
+def mapping(profile: Profile) -> RecordingSpec:
+    """How a profile maps its sensors, of which those of a flock are called bird1, bird2 … Raises ConfigError."""
+    flock = profile.minibird
+    if profile.driver == "recording" and profile.recording is not None and profile.recording.sensor:
+        return profile.recording
+    if profile.driver != "minibird" or flock is None:
+        raise ConfigError(f"device '{profile.name}' has no sensors to calibrate")
+    sensors = [
+        Sensor(f"bird{b.address}", b.tool, position_mm=b.position_mm, rotation_deg=b.rotation_deg) for b in flock.bird
+    ]
+    return RecordingSpec(
+        sensor=tuple(sensors),
+        scale=flock.scale,
+        position_mm=flock.position_mm,
+        rotation_deg=flock.rotation_deg,
+        anchor=flock.anchor,
+        distortion=flock.distortion,
+    )
+
+
 def sensor_of(profile: Profile, name: str | None) -> Sensor:
     """The sensor that is calibrated: the named one, or the only one. Raises ConfigError."""
-    sensors = {sensor.name: sensor for sensor in profile.recording.sensor} if profile.recording else {}
-    if not sensors:
-        raise ConfigError(f"device '{profile.name}' has no sensors to calibrate")
+    sensors = {sensor.name: sensor for sensor in mapping(profile).sensor}
     if name is None and len(sensors) == 1:
         return next(iter(sensors.values()))
     if name not in sensors:
@@ -64,17 +82,16 @@ def calibrate(
 
     Raises CalibrationError where it determines nothing or fits poorly.
     """
-    assert profile.recording is not None
+    spec = mapping(profile)
     if points is None and sweep is None and grid is None:
         raise CalibrationError("nothing was measured; give --points, --sweep or --grid")
-    if points is not None and profile.recording.anchor == "home":
+    if points is not None and spec.anchor == "home":
         raise CalibrationError(
             f"device '{profile.name}' starts each instrument where its task has it wait, wherever the scene is; "
-            'set anchor = "none" in [recording]'
+            f'set anchor = "none" in [{profile.driver}]'
         )
     kept = profile.calibration if profile.calibration is not None and grid is None else Calibration(date)
     found = replace(kept, date=date)
-    spec = profile.recording
     if grid is not None:
         found = replace(found, distortion=field_distortion.fit(grid.position, grid.known))
         spec = replace(spec, distortion=found.distortion)
@@ -95,6 +112,17 @@ def _place(points: Readings, spec: RecordingSpec, sensor: Sensor) -> touched_poi
     return touched_points.fit(tip, points.known)
 
 
+def read_places(path: Path) -> Array | None:
+    """Known places (n, 3) of a table that holds no readings there: the device is to be read at each; else None.
+
+    Raises ConfigError.
+    """
+    rows = pose_table.read_rows(path, ())
+    if any(column in rows[0][0] for column in READING) or not all(column in rows[0][0] for column in KNOWN):
+        return None
+    return pose_table.numbers(rows, KNOWN, str(path))
+
+
 def read_readings(path: Path) -> Readings:
     """Readings at known places from a CSV table: ``x_mm`` …, ``scene_x_mm`` …, and where known ``qw`` … ``qz``.
 
@@ -113,18 +141,3 @@ def read_sweep(path: Path, sensor: str) -> Sweep:
     """The poses in which a recording of any format saw a sensor. Raises ConfigError."""
     track = motion_file.read(path).track(sensor)
     return Sweep(track.position[track.ok], track.quaternion[track.ok])
-
-
-def from_files(
-    profile: Profile, date: str, sensor: str | None, points: Path | None, sweep: Path | None, grid: Path | None
-) -> Calibration:
-    """:func:`calibrate` with what files hold. Raises ConfigError, CalibrationError."""
-    chosen = sensor_of(profile, sensor)
-    return calibrate(
-        profile,
-        chosen,
-        date,
-        None if points is None else read_readings(points),
-        None if sweep is None else read_sweep(sweep, chosen.name),
-        None if grid is None else read_readings(grid),
-    )

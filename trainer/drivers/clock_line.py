@@ -15,7 +15,12 @@ WINDOW = 206
 FADE = 1.0 - 1.0 / WINDOW
 #: From so many samples on the period is fitted, too.
 ENOUGH = 10
+#: A device keeps the period that was asked for within this share of it, assumed. What a busy machine hands over at once
+#: would seem to have next to none, and all that follow would seem to come after lost ones.
+TRUE_TO = 0.05
 CATCH_UP = 8
+#: Before so many samples nothing counts as lost: what came together at the start has bent the line until then.
+SETTLED = 3 * WINDOW
 #: A sample so many periods after the last begins a new line (pause, power cycle).
 BREAK = 50
 
@@ -28,6 +33,7 @@ class ClockLine:
         self._nominal_s = period_s
         self._residual2 = 0.0  # s², sum over all samples of the session
         self._count = 0
+        self._mark = (0, 0.0, 0)  # the newest sample's number on its line, when it was due, the number of the line
         self._begin(0.0)
 
     def _begin(self, time_s: float) -> None:
@@ -47,23 +53,34 @@ class ClockLine:
         """
         if self._seen == 0 or arrived_s - self._newest_s > BREAK * self.period_s:
             self._begin(arrived_s)
+            number, line = 0, self._mark[2] + 1
         else:
-            self._shift(1 + self._lost(arrived_s), arrived_s - self._newest_s)
+            steps = 1 + self._lost(arrived_s)
+            number, line = self._mark[0] + steps, self._mark[2]
+            self._shift(steps, arrived_s - self._newest_s)
         self._seen += 1
         self._n += 1.0
         self._newest_s = arrived_s
         if self._seen >= ENOUGH:
-            self.period_s = (self._n * self._it - self._i * self._t) / (self._n * self._ii - self._i * self._i)
+            fitted_s = (self._n * self._it - self._i * self._t) / (self._n * self._ii - self._i * self._i)
+            low_s, high_s = (1.0 - TRUE_TO) * self._nominal_s, (1.0 + TRUE_TO) * self._nominal_s
+            self.period_s = min(max(fitted_s, low_s), high_s)
         self._due_s = arrived_s + (self._t - self.period_s * self._i) / self._n
         self._residual2 += (arrived_s - self._due_s) ** 2
         self._count += 1
+        self._mark = (number, self._due_s, line)
         return self._due_s
+
+    def read(self, now_s: float) -> tuple[float, int]:
+        """How many samples the device's clock says at ``now_s``, and since which of its beginnings; from any thread."""
+        number, due_s, line = self._mark
+        return number + (now_s - due_s) / self.period_s, line
 
     def _lost(self, arrived_s: float) -> int:
         """How many samples are known by now to have been lost."""
         late = (arrived_s - self._due_s) / self.period_s - 1.0
-        self._late = [*self._late, late] if late >= 0.5 else []
-        if len(self._late) < CATCH_UP:
+        self._late = [*self._late[1 - CATCH_UP :], late] if late >= 0.5 else []
+        if len(self._late) < CATCH_UP or self._seen < SETTLED:
             return 0
         lost = round(min(self._late))
         self._late = []

@@ -7,12 +7,12 @@ scene leaves it where it is, jaws and all, and the summary says why and how long
 from __future__ import annotations
 
 import time
-from array import array
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from trainer.drivers import field_distortion
+from trainer.drivers.latency import LatencyCount
 from trainer.geometry import Array, Rigid, quaternion_from_euler_deg
 from trainer.poses import ToolPoses
 from trainer.profile import Mount, Registration
@@ -58,13 +58,15 @@ class Placer:
         self._home = home
         self._scene_from_device = Rigid(np.array(spec.position_mm), quaternion_from_euler_deg(spec.rotation_deg))
         self._anchor: dict[int, Rigid] = {}
+        self._mounts: dict[int, Rigid] = {}
 
     def world_from_tool(self, tool: int, position: Array, quaternion: Array, mount: Mount) -> Rigid:
         """Where a sensor at ``position`` (3,) mm, ``quaternion`` (4,) wxyz of the device has its instrument."""
         position = field_distortion.correct(position[None], self._spec.distortion)[0]
         device_from_sensor = Rigid(self._spec.scale * position, quaternion)
-        sensor_from_tool = Rigid(np.array(mount.position_mm), quaternion_from_euler_deg(mount.rotation_deg))
-        pose = self._scene_from_device @ device_from_sensor @ sensor_from_tool
+        if tool not in self._mounts:
+            self._mounts[tool] = Rigid(np.array(mount.position_mm), quaternion_from_euler_deg(mount.rotation_deg))
+        pose = self._scene_from_device @ device_from_sensor @ self._mounts[tool]
         if self._spec.anchor == "none":
             return pose
         if tool not in self._anchor:
@@ -76,7 +78,7 @@ class Latency:
     """How long poses take from the device to the events of the tick that used them."""
 
     def __init__(self) -> None:
-        self._ms = array("d")
+        self.count = LatencyCount()
         self._fresh: list[float] = []
 
     def begin(self) -> None:
@@ -90,17 +92,12 @@ class Latency:
     def told(self) -> None:
         """The tick's events are with the sinks."""
         now = time.monotonic()
-        self._ms.extend(1e3 * (now - sent_s) for sent_s in self._fresh)
+        for sent_s in self._fresh:
+            self.count.add(1e3 * (now - sent_s))
         self._fresh.clear()
 
     def summary(self) -> dict[str, object]:
-        latency = np.array(self._ms) if self._ms else np.zeros(1)
-        return {
-            "poses": len(self._ms),
-            "p50": round(float(np.percentile(latency, 50)), 3),
-            "p99": round(float(np.percentile(latency, 99)), 3),
-            "max": round(float(latency.max()), 3),
-        }
+        return dict(self.count.summary())
 
 
 @dataclass

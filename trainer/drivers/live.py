@@ -133,11 +133,12 @@ class LivePoses:
         now = self._pace.wait(tick)
         self._latency.begin()
         valid = np.asarray(self._home.valid, dtype=bool).copy()
+        reasons = [""] * len(valid)
         for sensor, k in self._sensors:
-            reason = self._follow(sensor, k, now)
+            reasons[k] = reason = self._follow(sensor, k, now)
             valid[k] = not reason
             self._losses.note(sensor.tool, tick, reason)
-        return ToolPoses(self._position.copy(), self._quaternion.copy(), self._jaws.copy(), valid)
+        return ToolPoses(self._position.copy(), self._quaternion.copy(), self._jaws.copy(), valid, tuple(reasons))
 
     def _follow(self, sensor: Tracked, k: int, now: float) -> str:
         """Bring an instrument to where its sensor is; "" or why that is not known."""

@@ -39,10 +39,9 @@ class LoggedSession:
         if not 0 <= row < self._frames:
             return None
         self._consumed = row + 1
-        k = self._columns
-        return ToolPoses(
-            record.position[row, k], record.quaternion[row, k], record.closure[row, k], record.valid[row, k]
-        )
+        k, seen = self._columns, record.poses(row)
+        reason = tuple(seen.reason[c] for c in k)
+        return ToolPoses(seen.position[k], seen.quaternion[k], seen.closure[k], seen.valid[k], reason)
 
     def summary(self) -> dict[str, object]:
         """The file's and session's name, how many of its ticks were played, and how long it lasted."""

@@ -5,6 +5,7 @@ A bird without a fresh sample that is not flawed counts as not seen (:mod:`train
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack, closing
@@ -16,6 +17,7 @@ from trainer.config import ConfigError
 from trainer.drivers.clock_line import ClockLine
 from trainer.drivers.closure import ClosureSensor
 from trainer.drivers.in_hand import SWITCH_S, Latency, Losses, Pace, Placer
+from trainer.drivers.latency import LatencyCount
 from trainer.drivers.minibird_flock import UNHURRIED, Silences
 from trainer.drivers.minibird_record import Sample
 from trainer.drivers.minibird_stream import FlockStream
@@ -65,6 +67,8 @@ class Minibird:
         self._line = ClockLine(1.0 / spec.rate_hz)
         self._latency = Latency()
         self._losses = Losses(self._pace.tick_s)
+        self._tick, self._polled_s = 0, 0.0  # this tick, and when it began
+        self._rate_hz = spec.rate_hz
         with ExitStack() as opened:
             self._closure = opened.enter_context(closing(ClosureSensor(closure))) if closure is not None else None
             self._stream = opened.enter_context(closing(FlockStream(spec, self._take, silences)))
@@ -92,12 +96,14 @@ class Minibird:
             self._stream.start()
         now = self._pace.wait(tick)
         self._latency.begin()
+        self._tick, self._polled_s = tick, now
         valid = np.asarray(self._home.valid, dtype=bool).copy()
+        reasons = [""] * len(valid)
         for instrument in self._instruments:
-            reason = self._follow(instrument, now)
+            reasons[instrument.tool] = reason = self._follow(instrument, now)
             valid[instrument.tool] = not reason
             self._losses.note(instrument.bird.tool, tick, reason)
-        return ToolPoses(self._position.copy(), self._quaternion.copy(), self._jaws.copy(), valid)
+        return ToolPoses(self._position.copy(), self._quaternion.copy(), self._jaws.copy(), valid, tuple(reasons))
 
     def _follow(self, instrument: _Instrument, now: float) -> str:
         """Bring an instrument to where its bird is; "" or why that is not known."""
@@ -117,8 +123,7 @@ class Minibird:
                 turn = quaternion_conjugate(turn)
             pose = self._placer.world_from_tool(k, np.array(sample.position), turn, instrument.bird)
             if self._closure is not None and self._closure.has(tool) and instrument.used is not None:
-                way = np.linalg.norm(np.subtract(sample.position, instrument.used.position))
-                self._closure.moved(tool, float(way), now)
+                self._closure.moved(tool, math.dist(sample.position, instrument.used.position), now)
             self._position[k], self._quaternion[k] = pose.position, pose.quaternion
             instrument.used = sample
             self._latency.used(sample.sent_s)
@@ -128,6 +133,20 @@ class Minibird:
     def tick(self, record: object) -> None:
         """The events of a tick are with the sinks: how long did its poses take to become them?"""
         self._latency.told()
+
+    @property
+    def latency(self) -> LatencyCount:
+        """From a pose's first byte to its tick's events, of each pose that was used."""
+        return self._latency.count
+
+    def apart_ticks(self) -> tuple[float, int]:
+        """The session's clock when this tick began less the device's, in ticks, and which of its beginnings it is.
+
+        The device's clock counts its samples, lost ones too, at the rate that was asked for; it begins with the stream,
+        and anew after a pause. How far both come apart later is drift; a tick that begins late is not.
+        """
+        samples, begun = self._line.read(self._polled_s)
+        return self._tick - samples / self._rate_hz / self._pace.tick_s, begun
 
     def summary(self) -> dict[str, object]:
         """What was read, how late, and when and why it was not."""

@@ -41,6 +41,9 @@ from trainer.motion import Motion, Track
 from trainer.poses import ToolPoses
 from trainer.profile import RecordingSpec, Sensor
 
+#: Why an instrument is lost: samples are missing there, or are not OK.
+UNSEEN = "missing from the recording"
+
 
 class Recording:
     """Driver that plays a recorded motion; everything is computed when it is opened."""
@@ -80,7 +83,9 @@ class Recording:
             self._consumed = len(self._motion.time)
             return None
         self._consumed = int(self._end[tick]) + 1
-        return ToolPoses(self._position[tick], self._quaternion[tick], self._closure[tick], self._valid[tick])
+        valid = self._valid[tick]
+        reason = tuple("" if seen else UNSEEN for seen in valid)
+        return ToolPoses(self._position[tick], self._quaternion[tick], self._closure[tick], valid, reason)
 
     def summary(self) -> dict[str, object]:
         """Counts of the whole file and, as ``frames_consumed``, how many of its frames were played."""

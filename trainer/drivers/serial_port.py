@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+from contextlib import suppress
 from typing import Any
 
 import serial
@@ -32,7 +33,16 @@ def open_port(url: str, baud: int) -> Any:
         port.open()
     except (OSError, ValueError) as error:
         raise DeviceError(f"{url}: {_why(error)}") from None
+    _hand_over_at_once(port)
     return port
+
+
+def _hand_over_at_once(port: Any) -> None:
+    """USB adapters keep bytes for up to 16 ms, 1 ms where Linux asks them to; other ports have no such setting."""
+    ask = getattr(port, "set_low_latency_mode", None)
+    if ask is not None:
+        with suppress(OSError, ValueError, NotImplementedError):
+            ask(True)
 
 
 def _why(error: OSError | ValueError) -> str:
@@ -56,5 +66,10 @@ def set_reset(port: Any, held: bool) -> None:
 
 
 def read_some(port: Any) -> bytes:
-    """What has come, at least one byte unless ``READ_S`` pass without. Raises OSError where the port is gone."""
-    return bytes(port.read(max(1, port.in_waiting)))
+    """What has come, at least one byte unless ``READ_S`` pass without. Raises OSError where the port is gone.
+
+    First the wait, then all that came with the byte that ended it: one turn of the interpreter's lock for a record.
+    """
+    first = bytes(port.read(1))
+    waiting = port.in_waiting if first else 0
+    return first + bytes(port.read(waiting)) if waiting else first

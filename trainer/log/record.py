@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from trainer.events import Event
+from trainer.events import Event, TrackingLost
 from trainer.geometry import Array
+from trainer.poses import ToolPoses
 
 #: The key of ``SessionHeader.versions`` that holds the force, mN, at which the tissue counted as in equilibrium. It was
 #: chosen by measurements that may change, so a replay takes it from here.
@@ -49,6 +51,16 @@ class SessionRecord:
     quaternion: Array  # (n, k, 4) wxyz
     closure: Array  # (n, k)
     valid: np.ndarray  # (n, k) bool
+
+    def poses(self, row: int) -> ToolPoses:
+        """What the device gave at the stored tick ``row``, with the reasons that went into events."""
+        tick = self.first_tick + row
+        reason = tuple(self._why_lost.get((tick, tool), "") for tool in self.header.tools)
+        return ToolPoses(self.position[row], self.quaternion[row], self.closure[row], self.valid[row], reason)
+
+    @cached_property
+    def _why_lost(self) -> dict[tuple[int, str], str]:
+        return {(e.tick, e.tool): e.reason for e in self.events if isinstance(e, TrackingLost)}
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Sequence
 from datetime import datetime
 
@@ -34,6 +35,9 @@ from trainer.events import (
 )
 
 DISCLAIMER = "Training feedback, not a certificate."
+
+#: So many reasons why a device did not see an instrument are told in one line.
+MOST_REASONS = 3
 
 #: Units that are no part of a reader's language.
 _UNIT_WORDS = {"deg": "°", "count": "", "ratio": "", "mm3": "mm³"}
@@ -116,10 +120,21 @@ def _lain_over(over: str, body: str) -> str:
 def unseen(events: Sequence[TrackingLost | TrackingBack]) -> str:
     """How long one hand was out of the device's sight, of its losses and returns in a row."""
     returns = [e.lost_s for e in events if isinstance(e, TrackingBack)]
-    if len(events) == 1 or not returns:
+    if len(events) == 1:
         return describe(events[0])
-    total = f"not seen by the device for {sum(returns):.2f} s{' in all' if len(returns) > 1 else ''}"
-    return total + (", then lost again" if isinstance(events[-1], TrackingLost) else "")
+    words = "not seen by the device"
+    if returns:
+        words += f" for {sum(returns):.2f} s{' in all' if len(returns) > 1 else ''}"
+        words += ", then lost again" if isinstance(events[-1], TrackingLost) else ""
+    return words + _why([e.reason for e in events if isinstance(e, TrackingLost)])
+
+
+def _why(reasons: Sequence[str]) -> str:
+    """The reasons after a colon, the most frequent first; nothing where there are none."""
+    known = [reason for reason, _ in Counter(filter(None, reasons)).most_common()]
+    if len(known) > MOST_REASONS:
+        known[MOST_REASONS:] = ["and others"]
+    return f": {'; '.join(known)}" if known else ""
 
 
 def describe(event: Event) -> str:
@@ -163,7 +178,7 @@ def describe(event: Event) -> str:
             limit = f"{event.value:.0f} {event.unit}, limit {event.limit:.0f} {event.unit}"
             return f"{event.quantity.replace('_', ' ')}{where}: {limit}"
         case TrackingLost():
-            return "not seen by the device"
+            return f"not seen by the device{_why([event.reason])}"
         case TrackingBack():
             return f"seen again after {event.lost_s:.2f} s"
         case TickOverrun():

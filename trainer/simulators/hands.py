@@ -44,18 +44,27 @@ class Hands:
     def duration_s(self) -> float:
         return float(self.time[-1])
 
-    def at(self, time_s: float, bird: int) -> tuple[Rigid, float]:
-        """Pose and closure at ``time_s``; before and after the motion its first and last."""
+    def at(self, time_s: float, bird: int) -> Rigid:
+        """The pose at ``time_s``; before and after the motion its first and last."""
+        a, b, share = self._between(time_s)
+        if share == 0.0:
+            return Rigid(self.position[a, bird], self.quaternion[a, bird])
+        position = self.position[a, bird] + share * (self.position[b, bird] - self.position[a, bird])
+        return Rigid(position, slerp(self.quaternion[a, bird], self.quaternion[b, bird], share))
+
+    def closure_at(self, time_s: float, bird: int) -> float:
+        """Likewise."""
+        a, b, share = self._between(time_s)
+        return float(self.closure[a, bird] + share * (self.closure[b, bird] - self.closure[a, bird]))
+
+    def _between(self, time_s: float) -> tuple[int, int, float]:
+        """Two neighbouring samples, and how far ``time_s`` is from the first to the second."""
         after = int(np.searchsorted(self.time, time_s, side="right"))
         a, b = max(after - 1, 0), min(after, len(self.time) - 1)
-        span = self.time[b] - self.time[a]
-        share = float(np.clip((time_s - self.time[a]) / span, 0.0, 1.0)) if span > 0.0 and not self.sampled else 0.0
-        if share == 0.0:
-            return Rigid(self.position[a, bird], self.quaternion[a, bird]), float(self.closure[a, bird])
-        position = self.position[a, bird] + share * (self.position[b, bird] - self.position[a, bird])
-        turned = slerp(self.quaternion[a, bird], self.quaternion[b, bird], share)
-        closure = self.closure[a, bird] + share * (self.closure[b, bird] - self.closure[a, bird])
-        return Rigid(position, turned), float(closure)
+        span = float(self.time[b] - self.time[a])
+        if self.sampled or span <= 0.0:
+            return a, b, 0.0
+        return a, b, min(max((time_s - float(self.time[a])) / span, 0.0), 1.0)
 
 
 def open_hands(motion: str, spec: MinibirdSpec) -> Hands:

@@ -12,6 +12,8 @@ import numpy as np
 
 from trainer.simulators.faults import Faults
 
+FIFO = 16  # bytes that a common UART (16550A) collects
+PACKET = 64  # bytes of a USB packet
 CHUNKS = (1, 7, 16, 62)
 BUNCH_S = 0.016  # the latency timer of a common USB adapter
 #: A device that says more than its line can carry is cut off at so many writes, …
@@ -23,10 +25,13 @@ MOST_LATE = 64_000
 class Line:
     """One port. ``speed`` is how many times faster than real time everything runs.
 
+    ``piece`` is how many bytes the host's end of the line hands over together at the most, and
     ``link`` is the stable path at which hosts find the port, also after it was unplugged.
     """
 
-    def __init__(self, link: Path, baud: int, speed: float, faults: Faults, rng: np.random.Generator) -> None:
+    def __init__(
+        self, link: Path, baud: int, speed: float, faults: Faults, rng: np.random.Generator, piece: int
+    ) -> None:
         self._link = link
         self._baud = baud
         self._byte_s = 10.0 / (baud * speed)
@@ -34,6 +39,7 @@ class Line:
         self._most_late = int(MOST_LATE * speed)
         self._faults = faults
         self._rng = rng
+        self._piece = piece
         self._waiting: deque[tuple[float, bytes]] = deque()  # when the last byte of each piece is out
         self._late = b""  # what was due when the terminal was full
         self._free_s = 0.0  # when the line has sent what it was given
@@ -84,7 +90,7 @@ class Line:
             data = self._noise(len(data))
         start = 0
         while start < len(data):
-            size = int(self._rng.choice(CHUNKS)) if self._faults.split else len(data)
+            size = int(self._rng.choice(CHUNKS)) if self._faults.split else self._piece
             end = min(start + size, len(data))
             due = begun + end * self._byte_s
             if self._faults.bunch:

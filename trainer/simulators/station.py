@@ -15,7 +15,7 @@ from trainer.simulators.closure_board import BOOT, RATE_HZ, ClosureBoard
 from trainer.simulators.faults import Faults
 from trainer.simulators.flock import SILENCE_S, Flock
 from trainer.simulators.hands import Hands
-from trainer.simulators.line import Line
+from trainer.simulators.line import FIFO, PACKET, Line
 
 GARBAGE = 30  # bytes that a device of no known kind says in each cycle
 LATE_S = 0.1  # a process that slept longer leaves out what it would have measured
@@ -44,11 +44,12 @@ class Station:
         self._flock = Flock(present, self._pose, SILENCE_S / speed)
         own = [bird.address for bird in spec.bird] if not spec.port else [min(self._birds)]
         self._lines = {
-            address: Line(path, spec.baud, speed, faults, self._rng) for address, path in zip(own, ports, strict=False)
+            address: Line(path, spec.baud, speed, faults, self._rng, FIFO)
+            for address, path in zip(own, ports, strict=False)
         }
         self._board = ClosureBoard(closure) if closure is not None else None
         self._closure_line = (
-            Line(ports[-1], closure.baud, speed, closure_faults, self._rng) if closure is not None else None
+            Line(ports[-1], closure.baud, speed, closure_faults, self._rng, PACKET) if closure is not None else None
         )
         self._closure_s = 0.0  # when the next line is due
         self._begun_s: float | None = None  # when the first stream was asked for: motion begins
@@ -87,7 +88,7 @@ class Station:
             time_s = float(self._hands.time[min(self._sample, len(self._hands.time) - 1)])
         else:
             time_s = self._motion_s(time.monotonic())
-        return self._hands.at(time_s, self._birds[address])[0]
+        return self._hands.at(time_s, self._birds[address])
 
     def _happen(self, now: float) -> None:
         """What the faults have happen at this time of the motion."""
@@ -151,7 +152,7 @@ class Station:
             self._closure_s = now
             self._closure_line.send(BOOT, now)
         t, faults = self._motion_s(now), self._closure_faults
-        closure: dict[str, float] = {tool: self._hands.at(t, self._birds[a])[1] for a, tool in self._tools.items()}
+        closure: dict[str, float] = {tool: self._hands.closure_at(t, self._birds[a]) for a, tool in self._tools.items()}
         line = self._board.line(t, closure, faults.stuck.holds(t), faults.out_of_range.holds(t))
         if not faults.pause.holds(t):
             self._closure_line.send(line, self._closure_s)

@@ -76,6 +76,11 @@ class LogSink:
         if self._queue.qsize() >= BATCH_ROWS or any(e.kind in URGENT for e in record.events):
             self._wake.set()
 
+    @property
+    def waiting(self) -> int:
+        """How many ticks are not written yet."""
+        return self._queue.qsize()
+
     def record(self, outcome: str, ticks: int, duration_s: float) -> SessionRecord:
         """The session as the log will hold it once it is finished so; no tick may follow. Raises LogError.
 

@@ -124,6 +124,11 @@ class RecordingSink:
         self._thread.start()
 
     @property
+    def waiting(self) -> int:
+        """How many moments are not written yet."""
+        return self._queue.qsize()
+
+    @property
     def error(self) -> RecordingError | None:
         """Why the recording is incomplete, or None."""
         return self._failure or self._file.error

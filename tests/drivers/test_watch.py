@@ -1,0 +1,85 @@
+"""A live device outside of a session: how its records arrive, and what a sensor that is held still says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from simulated_devices import SHORT, loaded, simulated
+
+from trainer.calibration import CalibrationError
+from trainer.config import ConfigError
+from trainer.drivers import watch
+from trainer.drivers.serial_port import DeviceError
+from trainer.drivers.watch import STILL_MM, Watch
+from trainer.geometry import Array
+from trainer.profile import load_profile
+from trainer.simulators.hands import REST_MM
+
+
+@pytest.fixture(autouse=True)
+def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(watch, "UNHURRIED", SHORT)
+
+
+def test_a_device_at_rest_is_seen_where_it_is(tmp_path: Path) -> None:
+    """Bird k rests at (300, 50 k, 0) mm, which a word of 36 in / 8192 says within half its step of 0.11 mm; a touch
+    is the mean of such words, all alike. Tilted alike, its quaternion is wrong by 2/32768 in a component at the most.
+    """
+    with simulated(tmp_path) as path, Watch(loaded(path), keep_s=1.0) as device:
+        position, quaternion = device.touch(2)
+        arrived, seen = device.arrival(), device.seen()
+        oldest = device.samples(1)[0]
+        newest = device.samples(1)[-1]
+    np.testing.assert_allclose(position, [REST_MM, 50.0, 0.0], rtol=0, atol=0.5 * 36 * 25.4 / 8192)
+    assert np.linalg.norm(quaternion) == pytest.approx(1.0, abs=1e-12)
+    assert newest.arrived_s - oldest.arrived_s <= 1.0
+    assert arrived.records > 100
+    assert {name: tool for name, (tool, _) in seen.items()} == {"bird1": "right", "bird2": "left"}
+    for _, found in seen.values():
+        assert found.seen_percent > 50.0
+        assert found.closure == pytest.approx(0.0, abs=2 / 740)  # the converter's last digit, of 740
+    assert device.flaws["good"] > 100
+
+
+def test_what_is_silent_says_why(tmp_path: Path) -> None:
+    with simulated(tmp_path, "--fault", "mute") as path, Watch(loaded(path), keep_s=1.0) as device:
+        with pytest.raises(CalibrationError, match="bird 1: bird 1 is silent"):
+            device.poses(1, 0.8)
+        assert device.arrival().records == 0
+        assert device.seen()["bird1"][1].position_mm is None
+
+
+def still(strayed_mm: float) -> Watch:
+    """A device of which a sensor said 20 times the same, but once something else by so much."""
+    position: Array = np.zeros((20, 3))
+    position[7, 1] = strayed_mm
+    quaternion: Array = np.tile([1.0, 0.0, 0.0, 0.0], (20, 1))
+    quaternion[::2] *= -1.0  # the same rotation
+    device = Watch.__new__(Watch)
+    device.poses = lambda address, seconds: (position, quaternion)  # type: ignore[method-assign]
+    return device
+
+
+def test_a_touch_is_a_mean_of_what_is_held_still() -> None:
+    """One of 20 readings strays by d: the mean by d / 20, so that one is 19/20 d away from it."""
+    limit = STILL_MM * 20 / 19
+    position, quaternion = still(0.99 * limit).touch(1)
+    np.testing.assert_allclose(position, [0.0, 0.99 * limit / 20, 0.0], rtol=0, atol=1e-12)
+    assert abs(quaternion[0]) == pytest.approx(1.0, abs=1e-12)
+    with pytest.raises(CalibrationError, match=r"the sensor moved by 1\.5 mm; hold it still"):
+        still(1.01 * limit).touch(1)
+
+
+def test_only_a_live_device_is_looked_at() -> None:
+    with pytest.raises(ConfigError, match="'scripted-expert' receives no records"):
+        Watch(load_profile("scripted-expert").profile, 1.0)
+
+
+def test_a_watch_that_cannot_begin_leaves_nothing_open(tmp_path: Path) -> None:
+    """The closure sensor's port is free again after the flock was refused."""
+    with simulated(tmp_path, "--fault", "no-bird=2") as path:
+        for _ in range(2):
+            with pytest.raises(DeviceError, match="bird 2 is not there"):
+                Watch(loaded(path), 1.0)
