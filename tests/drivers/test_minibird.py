@@ -288,7 +288,8 @@ def test_a_flock_behind_a_socket_is_a_flock(healthy: Profile) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         bridge = threading.Thread(target=carry, args=(server, port))
         bridge.start()
-        flock = Flock(replace(spec_of(healthy), port=f"socket://127.0.0.1:{server.getsockname()[1]}"), SHORT)
+        spec = replace(spec_of(healthy), port=f"socket://127.0.0.1:{server.getsockname()[1]}")
+        flock = Flock(spec, replace(SHORT, answer_s=PATIENCE_S))  # a busy machine's bridge may be slow
         flock.connect()
         [(line, parser)] = flock.begin().values()
         ends = time.monotonic() + PATIENCE_S

@@ -27,7 +27,7 @@ from trainer.mechanics.links import energy
 from trainer.poses import ToolPoses
 from trainer.profile import Hand
 from trainer.scene import Scene
-from trainer.session import admit
+from trainer.session import NO_POSE, admit
 
 LEFT, RIGHT = 0, 1
 #: A leap of the tracker, mm.
@@ -219,7 +219,7 @@ def bad_poses(spoil: Callable[[ToolPoses], ToolPoses]) -> str:
         held, events, here = s.view().poses, list[Event](), _at(s, RIGHT)
         for k in range(40):
             good = _poses(s, RIGHT, here + 0.01 * k * np.array([0.0, 0.0, 1.0]), 1.0)
-            lost = replace(good, valid=np.arange(2) != RIGHT)
+            lost = replace(good, valid=np.arange(2) != RIGHT, reason=tuple(NO_POSE * (i == RIGHT) for i in range(2)))
             seen = good if k >= 20 else admit(spoil(good), held) if spoilt else lost
             events += step(s, seen)
             held = seen
