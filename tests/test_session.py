@@ -133,16 +133,52 @@ def test_an_interruption_aborts_between_two_ticks() -> None:
 
 
 def test_ctrl_c_lets_the_tick_finish() -> None:
-    scene, sink = FakeScene(99), FakeSink()
+    scene = FakeScene(99)
 
-    def press(tick: int) -> None:
-        if tick == 5:
+    def press(record: TickRecord) -> None:
+        if record.tick == 5 and not scene.outcome:
             os.kill(os.getpid(), signal.SIGINT)
 
+    sinks = [FakeSink(press), FakeSink()]
     with interruptible() as interrupted:
-        run(scene, FakeDriver([poses(0.0)] * 99, press), [sink], Fast(100.0), interrupted)
+        run(scene, FakeDriver([poses(0.0)] * 99), sinks, Fast(100.0), interrupted)
     assert scene.tick == 6
     assert scene.outcome == "aborted"
+    assert [record.tick for record in sinks[1].records] == [0, 1, 2, 3, 4, 5, 5]
+
+
+class NotedClock(Fast):
+    """Notes when a tick's work begins and ends."""
+
+    def __init__(self, notes: list[str]) -> None:
+        super().__init__(100.0)
+        self._notes = notes
+
+    def begin(self) -> None:
+        self._notes.append("begin")
+        super().begin()
+
+    def end(self) -> float:
+        self._notes.append("end")
+        return super().end()
+
+
+class InHand(FakeDriver):
+    """A device that hears when a tick's events are out."""
+
+    def tick(self, record: object) -> None: ...
+
+
+@pytest.mark.parametrize(
+    ("kind", "order"), [(FakeDriver, ["poll", "begin", "end"]), (InHand, ["begin", "poll", "end"])]
+)
+def test_a_device_in_a_hand_is_asked_in_the_tick_and_a_scripted_hand_before_it(
+    kind: type[FakeDriver], order: list[str]
+) -> None:
+    notes: list[str] = []
+    driver = kind([poses(0.0)] * 9, lambda tick: notes.append("poll"))
+    run(FakeScene(3), driver, [FakeSink()], NotedClock(notes))
+    assert notes == order * 3
 
 
 def test_a_second_ctrl_c_raises_and_the_handler_is_put_back() -> None:

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from trainer.clock import Fast
-from trainer.drivers.driver import Driver
+from trainer.drivers.driver import Driver, LiveDriver
 from trainer.events import Event, TickOverrun
 from trainer.poses import ToolPoses
 from trainer.sinks.surface import Frame, Sink, TickRecord
@@ -53,15 +53,24 @@ def run(
     Where the session ends because the input did or the trainee interrupted it, the closing events come in a
     second record of the last tick. An overrun is logged, in real time only, with the record after it, when its
     length is known.
+
+    A device in a hand is asked when the slot of a tick has begun: the newest pose counts. A scripted hand looks at the
+    scene and decides, and a file is read, while the slot is waited for; that is no work of the tick.
     """
     poses = scene.home
     tick = 0
     late_ms = 0.0
+    in_hand = isinstance(driver, LiveDriver)
+    seen: ToolPoses | None = None
     while not scene.outcome:
+        if not in_hand:
+            seen = driver.poll(scene.tick, scene.view())
         clock.begin()
+        if in_hand:
+            seen = driver.poll(scene.tick, scene.view())
         if interrupted():
             events = scene.finish("aborted", "interrupted")
-        elif (seen := driver.poll(scene.tick, scene.view())) is None:
+        elif seen is None:
             events = scene.finish("failed", "the input ended before the task was done")
         else:
             tick = scene.tick

@@ -239,7 +239,7 @@ def unplug() -> bool:
     ("happens", "outcome", "reason", "ticks"),
     [
         (lambda: False, "failed", "the input ended before the task was done", 10),
-        (press_ctrl_c, "aborted", "interrupted", 11),
+        (press_ctrl_c, "aborted", "interrupted", 10),
     ],
 )
 def test_a_session_that_stops_early_is_whole(
@@ -252,7 +252,7 @@ def test_a_session_that_stops_early_is_whole(
     tmp_path: Path,
     at_tick_10: Callable[[Callable[[], object]], None],
 ) -> None:
-    """It is stored, scored and sealed; Ctrl-C lets the tick finish in which it was pressed. Exit code 0: it ran."""
+    """It is stored, scored and sealed; after Ctrl-C no tick begins. Exit code 0: it ran."""
     at_tick_10(happens)
     db = tmp_path / "log.db"
     code, out, err = command_line("practice", task, "--fast", "--db", db, "--json")

@@ -4,9 +4,10 @@ A matrix whose entries lie within b of the diagonal needs n b² multiplications 
 (Golub and Van Loan, Matrix Computations, section 4.3). The factor is kept by columns, and both substitutions take the
 three columns of a node at once: forwards they subtract multiples of contiguous stretches, backwards they sum products.
 
-The factor is computed in double precision; it is kept, and solved with, in single: a solve is bound by the memory that
-it reads and by the numbers that fit into a register, and single precision halves the one and doubles the other. So a
-solve is right to about 1e-6 of its answer: a base for iterations that measure their own residual, not an answer.
+The factor is computed in double precision and kept in whole numbers of 16 bits, a unit for each column; a solve adds up
+in single precision. It is bound by the memory that it reads, and this is half of what single precision reads: two
+vessels' factors then stay in the cache of a core. A solve is right to about 1e-4 of its answer, and L D Lᵀ positive
+definite as ever: a base for iterations that measure their own residual, not an answer.
 """
 
 from __future__ import annotations
@@ -22,13 +23,16 @@ from trainer.geometry import Array
 SINGULAR = 1e-9
 #: Columns that the factorisation subtracts from a later one at once.
 GROUP = 4
+#: The largest number in a column of a kept factor.
+LARGEST = 32767.0
 
 
 class BandedFactor(NamedTuple):
     """L and D of K = L D Lᵀ for the nodes ``order``; the unknown 3 p + c is component c of node ``order[p]``."""
 
     order: np.ndarray  # (f,) int32 nodes, in the order of elimination
-    columns: np.ndarray  # (3 f, b) float32, L[j + 1 + k, j]
+    columns: np.ndarray  # (3 f, b) int16, L[j + 1 + k, j] in units of …
+    unit: np.ndarray  # (3 f,) float32, of a column
     inverse: Array  # (3 f,) 1 / D[j]
 
 
@@ -57,15 +61,16 @@ def factor_band(
     band: Array,
     diagonal: Array,
     columns: np.ndarray,
+    unit: np.ndarray,
     inverse: Array,
     least: float,
 ) -> int:
     """L D Lᵀ, L with unit diagonal, column by column from those before it (left-looking).
 
     ``band`` (3 f, b + 1 + GROUP) holds K as in :func:`assemble_band`, with zeros in its last columns, and is
-    overwritten with D Lᵀ. ``columns[j, k]`` is L[j + 1 + k, j], ``inverse[j]`` is 1 / D[j]. A pivot that is below the
-    share ``least`` of ``diagonal`` (3 f,), the band's own before, is replaced by it, so that the rest stays finite.
-    Returns how often that was done: unless it is 0, the factor is that of another matrix.
+    overwritten with D Lᵀ. ``columns[j, k]`` times ``unit[j]`` is L[j + 1 + k, j], ``inverse[j]`` is 1 / D[j]. A pivot
+    that is below the share ``least`` of ``diagonal`` (3 f,), the band's own before, is replaced by it, so that the rest
+    stays finite. Returns how often that was done: unless it is 0, the factor is that of another matrix.
     """
     n, b = columns.shape
     replaced = 0
@@ -96,31 +101,37 @@ def factor_band(
             pivot = diagonal[j]
             replaced += 1
         inverse[j] = 1.0 / pivot
+        largest = 0.0
         for k in range(1, size):
-            columns[j, k - 1] = band[j, k] * inverse[j]
+            largest = max(largest, abs(band[j, k] * inverse[j]))
+        unit[j] = largest / LARGEST
+        if unit[j] == 0.0:
+            unit[j] = 1.0
+        for k in range(1, size):
+            columns[j, k - 1] = round(band[j, k] * inverse[j] / unit[j])
     return replaced
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def substitute_forwards(columns: np.ndarray, inverse: Array, v: np.ndarray) -> None:
+def substitute_forwards(columns: np.ndarray, unit: np.ndarray, inverse: Array, v: np.ndarray) -> None:
     """Overwrites ``v`` (3 f,) float32 with D⁻¹ L⁻¹ v."""
     n, b = columns.shape
     for j in range(0, n, 3):
-        a0 = v[j]
-        v[j + 1] -= a0 * columns[j, 0]
-        a1 = v[j + 1]
-        v[j + 2] -= a0 * columns[j, 1] + a1 * columns[j + 1, 0]
-        a2 = v[j + 2]
+        a0 = v[j] * unit[j]
+        v[j + 1] -= a0 * np.float32(columns[j, 0])
+        a1 = v[j + 1] * unit[j + 1]
+        v[j + 2] -= a0 * np.float32(columns[j, 1]) + a1 * np.float32(columns[j + 1, 0])
+        a2 = v[j + 2] * unit[j + 2]
         below = n - 3 - j
         reach = min(b - 2, below)
         c0, c1, c2 = columns[j, 2 : 2 + reach], columns[j + 1, 1 : 1 + reach], columns[j + 2, :reach]
         target = v[j + 3 : j + 3 + reach]
         for k in range(reach):
-            target[k] -= a0 * c0[k] + a1 * c1[k] + a2 * c2[k]
+            target[k] -= a0 * np.float32(c0[k]) + a1 * np.float32(c1[k]) + a2 * np.float32(c2[k])
         if reach < below:  # the second and third columns reach one and two rows further
-            v[j + 3 + reach] -= a1 * columns[j + 1, 1 + reach] + a2 * columns[j + 2, reach]
+            v[j + 3 + reach] -= a1 * np.float32(columns[j + 1, 1 + reach]) + a2 * np.float32(columns[j + 2, reach])
         if reach + 1 < below:
-            v[j + 4 + reach] -= a2 * columns[j + 2, 1 + reach]
+            v[j + 4 + reach] -= a2 * np.float32(columns[j + 2, 1 + reach])
     for j in range(n):
         v[j] *= inverse[j]
 
@@ -128,7 +139,7 @@ def substitute_forwards(columns: np.ndarray, inverse: Array, v: np.ndarray) -> N
 # The one kernel whose sums the compiler may reorder: they do not vectorise otherwise, and the factor would have to be
 # kept by rows as well. The order is fixed when it is compiled, so results are still the same bits in every run.
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc"})
-def substitute_backwards(columns: np.ndarray, v: np.ndarray) -> None:
+def substitute_backwards(columns: np.ndarray, unit: np.ndarray, v: np.ndarray) -> None:
     """Overwrites ``v`` (3 f,) float32 with L⁻ᵀ v."""
     n, b = columns.shape
     for j in range(n - 3, -1, -3):
@@ -138,17 +149,17 @@ def substitute_backwards(columns: np.ndarray, v: np.ndarray) -> None:
         known = v[j + 3 : j + 3 + reach]
         s0 = s1 = s2 = np.float32(0.0)
         for k in range(reach):
-            s0 += c0[k] * known[k]
-            s1 += c1[k] * known[k]
-            s2 += c2[k] * known[k]
+            s0 += np.float32(c0[k]) * known[k]
+            s1 += np.float32(c1[k]) * known[k]
+            s2 += np.float32(c2[k]) * known[k]
         if reach < below:
-            s1 += columns[j + 1, 1 + reach] * v[j + 3 + reach]
-            s2 += columns[j + 2, reach] * v[j + 3 + reach]
+            s1 += np.float32(columns[j + 1, 1 + reach]) * v[j + 3 + reach]
+            s2 += np.float32(columns[j + 2, reach]) * v[j + 3 + reach]
         if reach + 1 < below:
-            s2 += columns[j + 2, 1 + reach] * v[j + 4 + reach]
-        v[j + 2] -= s2
-        v[j + 1] -= s1 + columns[j + 1, 0] * v[j + 2]
-        v[j] -= s0 + columns[j, 0] * v[j + 1] + columns[j, 1] * v[j + 2]
+            s2 += np.float32(columns[j + 2, 1 + reach]) * v[j + 4 + reach]
+        v[j + 2] -= unit[j + 2] * s2
+        v[j + 1] -= unit[j + 1] * (s1 + np.float32(columns[j + 1, 0]) * v[j + 2])
+        v[j] -= unit[j] * (s0 + np.float32(columns[j, 0]) * v[j + 1] + np.float32(columns[j, 1]) * v[j + 2])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -175,8 +186,8 @@ def solve(kept: BandedFactor, values: Array, v: np.ndarray, out: Array) -> None:
     """
     u = v[: len(kept.inverse)]
     gather(values, kept.order, u)
-    substitute_forwards(kept.columns, kept.inverse, u)
-    substitute_backwards(kept.columns, u)
+    substitute_forwards(kept.columns, kept.unit, kept.inverse, u)
+    substitute_backwards(kept.columns, kept.unit, u)
     scatter(u, kept.order, out)
 
 
@@ -200,8 +211,9 @@ def room(links: np.ndarray, order: np.ndarray, node_count: int) -> tuple[Band, B
     b = min(3 * reach + 2, size - 1)
     # Written now: a page of memory that is touched for the first time costs time, milliseconds for these.
     band = Band(np.ascontiguousarray(links), place, np.full((size, b + 1 + GROUP), 0.0), np.zeros(size))
-    columns = np.full((size, b), 0.0, dtype=np.float32)
-    return band, BandedFactor(np.ascontiguousarray(order, dtype=np.int32), columns, np.zeros(size))
+    columns = np.full((size, b), 0, dtype=np.int16)
+    unit = np.full(size, 1.0, dtype=np.float32)
+    return band, BandedFactor(np.ascontiguousarray(order, dtype=np.int32), columns, unit, np.zeros(size))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -211,7 +223,7 @@ def factor_blocks(blocks: Array, band: Band, out: BandedFactor, least: float) ->
     band.values[:] = 0.0
     assemble_band(blocks, band.links, band.place, band.values)
     band.diagonal[:] = band.values[:, 0]
-    return factor_band(band.values, band.diagonal, out.columns, out.inverse, least)
+    return factor_band(band.values, band.diagonal, out.columns, out.unit, out.inverse, least)
 
 
 def factor(blocks: Array, links: np.ndarray, order: np.ndarray, node_count: int) -> BandedFactor:
