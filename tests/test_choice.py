@@ -294,7 +294,7 @@ def test_a_scene_without_tissue_allocates_none() -> None:
     """Arrays of poses and needle remain, a few dozen numbers; with the vessel 1008 nodes and their factor come."""
     task = bare()
     without = scene.build(task).world
-    assert (without.tissue, without.solver, without.walls, without.before.size) == (None, None, {}, 0)
+    assert (without.tissue, without.solver, without.surface.size, without.before.size) == (None, None, 0, 0)
     assert held_bytes(without, set()) <= 100 * 8
     whole = scene.build(one_drive()).world
     assert whole.solver is not None

@@ -6,6 +6,7 @@ happened. A step is a function of task, tolerance, state and poses alone: it rea
 
 from __future__ import annotations
 
+import itertools
 import math
 from types import ModuleType
 
@@ -63,9 +64,14 @@ def build(task: Task, tolerance_mN: float = holding.TOLERANCE_MN) -> Scene:
         world.tissue = tissue
         world.solver = Equilibrium(tissue.mesh, tissue.orders())
         world.before = world.solver.x.copy()
-        for v, vessel in enumerate(tissue.vessels):
-            for wall, triangles in (("outer", vessel.outer_triangles), ("inner", vessel.inner_triangles)):
-                world.walls[v, wall] = (triangles + tissue.offset[v]).astype(np.int32)
+        walls = [
+            (v, wall, (triangles + tissue.offset[v]).astype(np.int32))
+            for v, vessel in enumerate(tissue.vessels)
+            for wall, triangles in (("outer", vessel.outer_triangles), ("inner", vessel.inner_triangles))
+        ]
+        world.surface = np.concatenate([triangles for _, _, triangles in walls])
+        ends = itertools.accumulate(len(triangles) for _, _, triangles in walls)
+        world.part = {(v, wall): (end - len(t), end) for (v, wall, t), end in zip(walls, ends, strict=True)}
     if spec.needle is not None:
         world.needle = Needle(spec.needle.length_mm / math.radians(spec.needle.arc_deg), spec.needle.length_mm)
         _hand_over_needle(world)
@@ -199,8 +205,8 @@ class Scene:
             pierce.glide(world)
         holding.equilibrate(world, before, start_s, span_s, tool, self.tolerance_mN)
         pierce.follow_needle(world, end_s, tool)
-        giving_way.relieve(world, end_s)
-        thread_pull.settle(world, end_s)
+        slack = giving_way.relieve(world, end_s)
+        thread_pull.settle(world, end_s, slack)
         drape.tell(world, end_s)
 
     def _lead_needle(self) -> str:

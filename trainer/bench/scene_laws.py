@@ -110,7 +110,7 @@ def settled(s: Scene) -> float:
         free[hole.place.nodes] = False
     for jaw in world.jaws:
         if jaw.target == "wall":
-            free[world.walls[jaw.vessel, jaw.wall].ravel()] = False
+            free[world.wall(jaw.vessel, jaw.wall).ravel()] = False
     if world.contact is not None:
         free[world.contact.place.nodes] = False
     left = float(np.max(np.linalg.norm(forces(mesh, world.solver.x)[free], axis=1), initial=0.0))

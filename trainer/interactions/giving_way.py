@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from trainer.events import Overforce, Tear
-from trainer.geometry import Array
+from trainer.geometry import Array, length
 from trainer.interactions import grasp, pierce, thread_pull
 from trainer.interactions.world import Hole, World
 from trainer.mechanics.attachments import Anchors, Cable
@@ -38,8 +38,8 @@ def judge(
 ) -> None:
     """Judge the forces that an equilibrium ``found``. One thing gives way at a time: the rest may bear without it."""
     by_needle, by_jaw = _pulls(world, held, found.anchor_force)
-    loads = [float(np.linalg.norm(f)) for f in by_jaw]
-    world.tissue_force_mN = max(world.tension_mN, float(np.linalg.norm(by_needle)), *loads)
+    loads = [length(f) for f in by_jaw]
+    world.tissue_force_mN = max(world.tension_mN, length(by_needle), *loads)
     if found.residual_mN <= SETTLED * world.tissue_force_mN:
         holes = _on_needle(held, found.anchor_force)
         for (first, last, cable), tension in zip(taut, found.tension, strict=True):
@@ -47,20 +47,28 @@ def judge(
             if not _draw(world, rows, first, last, float(tension), time_s):
                 holes += _on_thread(rows, first, last, cable, float(tension))
         _tear_worst(world, holes, time_s)
-        _judge_needle(world, float(np.linalg.norm(by_needle)), time_s)
+        _judge_needle(world, length(by_needle), time_s)
         for i, load in enumerate(loads):
             _judge_jaw(world, i, load, time_s)
     _limits(world, time_s)
 
 
-def relieve(world: World, time_s: float) -> None:
-    """A thread pulled apart further than it and the tissue give: the weakest grip slips, or it breaks."""
+def relieve(world: World, time_s: float) -> thread_pull.Slack | None:
+    """A thread pulled apart further than it and the tissue give: the weakest grip slips, or it breaks.
+
+    Returns how the thread then runs; None without one.
+    """
     if world.thread is None:
-        return
-    while (found := thread_pull.overdrawn(world)) is not None:
-        first, last, rows = found
+        return None
+    while True:
+        for jaw in world.jaws:
+            jaw.lag_mm = 0.0
+        slack = thread_pull.slacken(world)
+        found = thread_pull.overdrawn(world, slack)
+        if found is None:
+            return slack if not any(jaw.lag_mm for jaw in world.jaws) else thread_pull.slacken(world)
         # Rigid, its load rises until something gives way.
-        _draw(world, rows, first, last, math.inf, time_s)
+        _draw(world, slack.held, *found, math.inf, time_s)
 
 
 def _pulls(world: World, held: Grips, force: Array) -> tuple[Array, list[Array]]:
@@ -75,7 +83,7 @@ def _pulls(world: World, held: Grips, force: Array) -> tuple[Array, list[Array]]
 
 
 def _on_needle(held: Grips, force: Array) -> list[tuple[Hole, float]]:
-    return [(who, float(np.linalg.norm(force[r]))) for r, who in enumerate(held.owner) if isinstance(who, Hole)]
+    return [(who, length(force[r])) for r, who in enumerate(held.owner) if isinstance(who, Hole)]
 
 
 def _on_thread(
@@ -89,10 +97,10 @@ def _on_thread(
         pull = np.zeros(3)
         for k, inside in ((row - 1, cable.channel[row - 1 - first]), (row + 1, cable.channel[row - first])):
             way = rows.position[k] - rows.position[row]
-            size = float(np.linalg.norm(way))
+            size = length(way)
             if not inside and size > 0.0:
                 pull += tension * way / size
-        found.append((hole, float(np.linalg.norm(pull))))
+        found.append((hole, length(pull)))
     return found
 
 

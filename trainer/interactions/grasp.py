@@ -136,7 +136,8 @@ def _catch_wall(world: World, tool: int, jaw: Jaw, spec: InstrumentSpec, before:
     narrowest = jaw_gap_mm(jaw.closure)
     if all(narrowest >= v.spec.wall_mm for v in world.tissue.vessels):
         return
-    for (vessel, wall), triangles in world.walls.items():
+    for vessel, wall in world.part:
+        triangles = world.wall(vessel, wall)
         triangle, weights = nearest_on_surface(centre, world.solver.x, triangles)
         distance = float(np.linalg.norm(weights @ world.solver.x[triangles[triangle]] - centre))
         thick = world.tissue.vessels[vessel].spec.wall_mm
@@ -147,7 +148,7 @@ def _catch_wall(world: World, tool: int, jaw: Jaw, spec: InstrumentSpec, before:
     if found is None:
         return
     _, vessel, wall, triangle, weights = found
-    nodes = world.walls[vessel, wall][triangle]
+    nodes = world.wall(vessel, wall)[triangle]
     corners = [place_on(world, vessel, wall, nodes, w) for w in np.eye(3)]
     jaw.target, jaw.vessel, jaw.wall = "wall", vessel, wall
     jaw.slots = tuple(world.solver.hold(c.nodes, c.weights) for c in corners)

@@ -14,7 +14,7 @@ import numpy as np
 from trainer.anatomy.vessel import material_coordinates, ring
 from trainer.curriculum import VesselSpec
 from trainer.events import Contact, Pierce, PullThrough, Withdraw
-from trainer.geometry import Array, Rigid, cross, unit
+from trainer.geometry import Array, Rigid, cross, length, unit
 from trainer.instruments.needle import needle_closest, needle_point, needle_tangent
 from trainer.interactions.crossing import first_crossing, nearest_on_surface
 from trainer.interactions.world import Hole, Place, TipContact, World
@@ -35,17 +35,13 @@ def detect(world: World, before: Rigid, after: Rigid, start_s: float, span_s: fl
     """Begin a contact where the tip meets a wall on its way from ``before`` to ``after`` (world_from_needle)."""
     if world.tissue is None or world.solver is None or world.contact is not None:
         return
-    best: tuple[float, Place, bool] | None = None
-    for v in range(len(world.tissue.vessels)):
-        for wall in ("outer", "inner"):
-            triangles = world.walls[v, wall]
-            skip = _passed(world, v, wall, triangles)
-            hit = first_crossing(before.position, after.position, world.before, world.solver.x, triangles, skip)
-            if hit is not None and (best is None or hit[1] < best[0]):
-                best = (hit[1], place_on(world, v, wall, triangles[hit[0]], hit[3]), hit[2])
-    if best is None:
+    triangles = world.surface
+    hit = first_crossing(before.position, after.position, world.before, world.solver.x, triangles, _passed(world))
+    if hit is None:
         return
-    fraction, place, inwards = best
+    triangle, fraction, inwards, weights = hit
+    vessel, wall = next(at for at, (first, last) in world.part.items() if first <= triangle < last)
+    place = place_on(world, vessel, wall, triangles[triangle], weights)
     normal, _ = world.undented(place)
     slot = world.solver.hold(place.nodes, place.weights)
     world.contact = TipContact(place, slot, inwards, _sticks(world, after, normal), fraction, 0.0, normal)
@@ -66,7 +62,7 @@ def glide(world: World) -> None:
     if contact is None or contact.stuck or world.solver is None:
         return
     tip = world.needle_pose.position
-    triangles = world.walls[contact.place.vessel, contact.place.wall]
+    triangles = world.wall(contact.place.vessel, contact.place.wall)
     triangle, weights = nearest_on_surface(tip, world.solver.x, triangles)
     world.solver.drop(contact.slot)
     contact.place = place_on(world, contact.place.vessel, contact.place.wall, triangles[triangle], weights)
@@ -91,7 +87,7 @@ def puncture(world: World, before: Rigid, after: Rigid, force: Array, start_s: f
         world.before = world.solver.x.copy()
         return
     along, limit = float(force @ tangent), _puncture_mN(world, contact.place)
-    reached = max(along, float(np.linalg.norm(force)) / SIDEWAYS)
+    reached = max(along, length(force) / SIDEWAYS)
     if reached < limit:
         contact.stuck = _sticks(world, after, normal)
         contact.force_mN, contact.normal, contact.fraction = reached, normal, 0.0
@@ -121,10 +117,10 @@ def follow_needle(world: World, time_s: float, tool: str) -> None:
     """Bring each hole on the needle to the arc at which the needle now goes through it."""
     if world.needle is None or world.solver is None:
         return
-    length = world.needle.length
+    rear = world.needle.length
     needle_from_scene = world.needle_pose.inverse()
     for hole in world.open_holes():
-        if hole.arc > length:
+        if hole.arc > rear:
             continue
         point = world.point(hole.place)
         arc = _arc_through(world, needle_from_scene.apply(point))
@@ -140,7 +136,7 @@ def follow_needle(world: World, time_s: float, tool: str) -> None:
             close(world, hole)
             world.before = world.solver.x.copy()  # out of the hole as the wall lies now
             world.emit(Withdraw, time_s, tool, end="tip", **shared)
-        elif arc > length:
+        elif arc > rear:
             hole.drawn_mm = 0.0
             world.emit(PullThrough, time_s, tool, **shared)
             if world.thread is None:
@@ -200,12 +196,14 @@ def _needle_length(world: World) -> float:
     return world.needle.length if world.needle else 0.0
 
 
-def _passed(world: World, vessel: int, wall: str, triangles: np.ndarray) -> np.ndarray:
-    """Triangles (f,) bool that touch a hole which the tip has only just gone through, or is coming back to."""
-    skip = np.zeros(len(triangles), dtype=np.bool_)
+def _passed(world: World) -> np.ndarray:
+    """Triangles (f,) bool of the walls that touch a hole which the tip has only just gone through, or is coming back
+    to."""
+    skip = np.zeros(len(world.surface), dtype=np.bool_)
     for hole in world.open_holes():
-        if hole.place.vessel == vessel and hole.place.wall == wall and hole.arc < JUST_THROUGH_MM:
-            skip |= np.isin(triangles, hole.place.nodes).any(axis=1)
+        if hole.arc < JUST_THROUGH_MM:
+            first, last = world.part[hole.place.vessel, hole.place.wall]
+            skip[first:last] |= np.isin(world.surface[first:last], hole.place.nodes).any(axis=1)
     return skip
 
 

@@ -14,13 +14,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from trainer.events import Break, Withdraw
-from trainer.geometry import Array, Rigid, cross, quaternion_from_axis_angle, quaternion_multiply, unit
+from trainer.geometry import Array, Rigid, cross, length, quaternion_from_axis_angle, quaternion_multiply, unit
 from trainer.instruments.needle import needle_point
 from trainer.interactions import drape
 from trainer.interactions.pierce import close, draw
 from trainer.interactions.world import Hole, World
 from trainer.mechanics.attachments import Cable
-from trainer.mechanics.thread import break_at, closest, follow, length_error, polyline, slide
+from trainer.mechanics.thread import Slid, break_at, closest, follow, length_error, polyline, slide
 
 #: Thread without holes between two grips is rigid: more than this too short, mm, and something gives way.
 RIGID_MM = 1e-6
@@ -37,6 +37,14 @@ class Constraints:
     hard: np.ndarray  # (c,) bool
     hole: tuple[Hole | None, ...]
     grip: tuple[int, ...]  # instrument, or -1
+
+
+@dataclass(frozen=True)
+class Slack:
+    """Where the thread is held, and how it slides through its holes between."""
+
+    held: Constraints
+    slid: Slid
 
 
 def constraints(world: World, lagging: bool = True) -> Constraints:
@@ -109,28 +117,36 @@ def cables(world: World, held: Constraints) -> list[tuple[int, int, Cable]]:
             inside = float(np.sum(np.linalg.norm(np.diff(place, axis=0), axis=1)[channel[:-1]]))
             slots = np.array([h.slot if h is not None else -1 for h in holes], dtype=np.int64)
             round_about = float(np.sum(drape.detours(world, held)[first:last]))
-            length = float(held.arc[last] - held.arc[first]) - inside - round_about
-            found.append((first, last, Cable(slots, place, length, channel)))
+            outside = float(held.arc[last] - held.arc[first]) - inside - round_about
+            found.append((first, last, Cable(slots, place, outside, channel)))
     return found
 
 
-def settle(world: World, time_s: float) -> None:
-    """Let the thread slide through its holes and lay it from constraint to constraint, over what it meets."""
-    if world.thread is None:
-        return
-    _run_and_lay(world, time_s)
-    for _ in range(drape.TURNS):
-        if world.draping is not None and world.draping.lacks:
-            _run_and_lay(world, time_s, again=True)
-
-
-def _run_and_lay(world: World, time_s: float, again: bool = False) -> None:
-    """``again``: only if the holes can give what is lacking; else the next movement finds the thread too short."""
+def slacken(world: World) -> Slack:
+    """How the thread slides through its holes, as everything is now."""
     assert world.thread is not None
     held = constraints(world)
-    slid = slide(world.thread, held.arc, held.position, held.hard, world.pieces, drape.detours(world, held))
-    if again and np.any(slid.shortage > 0.0):
+    return Slack(
+        held, slide(world.thread, held.arc, held.position, held.hard, world.pieces, drape.detours(world, held))
+    )
+
+
+def settle(world: World, time_s: float, slack: Slack | None) -> None:
+    """Let the thread slide through its holes as ``slack`` says and lay it from constraint to constraint, over what it
+    meets."""
+    if slack is None:
         return
+    _run_and_lay(world, time_s, slack)
+    for _ in range(drape.TURNS):
+        if world.draping is not None and world.draping.lacks:
+            slack = slacken(world)
+            # Else the holes cannot give what is lacking: the next movement finds the thread too short.
+            if not np.any(slack.slid.shortage > 0.0):
+                _run_and_lay(world, time_s, slack)
+
+
+def _run_and_lay(world: World, time_s: float, slack: Slack) -> None:
+    held, slid = slack.held, slack.slid
     for row, hole in enumerate(held.hole):
         if hole is None:
             continue
@@ -145,26 +161,25 @@ def _run_and_lay(world: World, time_s: float, again: bool = False) -> None:
     lay(world, constraints(world) if np.any(slid.pulled_out) else replace(held, arc=slid.arc))
 
 
-def overdrawn(world: World) -> tuple[int, int, Constraints] | None:
-    """A run that its ends pull further apart than thread and tissue give: first row, last row, constraints.
+def overdrawn(world: World, slack: Slack) -> tuple[int, int] | None:
+    """A run that its ends pull further apart than thread and tissue give: first and last row.
 
     What a run with holes lacks is the tissue's lag behind the instruments: its last grip gives that much thread until
     the equilibrium has caught up, unless it is too much. A run without holes is rigid.
     """
     assert world.thread is not None
-    for jaw in world.jaws:
-        jaw.lag_mm = 0.0
-    held = constraints(world)
-    slid = slide(world.thread, held.arc, held.position, held.hard, world.pieces, drape.detours(world, held))
+    held, slid = slack.held, slack.slid
+    if not np.any(slid.shortage > 0.0):
+        return None
     for first, last in runs(world, held):
         lack = float(slid.shortage[first])
         if last - first == 1:
             if lack > RIGID_MM:
-                return first, last, held
+                return first, last
         elif lack > 0.0:
             room = held.arc[last + 1] if last + 1 < len(held.arc) else world.thread.end
             if lack > min(MOST_LAG_MM, room - held.arc[last]):
-                return first, last, held
+                return first, last
             world.jaws[held.grip[last]].lag_mm = lack
     for first, last in runs(world, held):
         if last - first == 1 and slid.shortage[first] > 0.0:  # rounding
@@ -235,8 +250,7 @@ def _towards_needle(held: Constraints, row: int) -> Array:
     if row == 0:
         return np.zeros(3)
     way = held.position[row - 1] - held.position[row]
-    length = float(np.linalg.norm(way))
-    return unit(way) if length > 1e-9 else np.zeros(3)
+    return unit(way) if length(way) > 1e-9 else np.zeros(3)
 
 
 def _trail(world: World) -> None:
@@ -247,7 +261,7 @@ def _trail(world: World) -> None:
     chord = world.needle_pose.rotate(in_needle)
     pulled = rear - world.needle_pose.position
     axis = cross(chord, pulled)
-    sine, cosine = float(np.linalg.norm(axis)), float(chord @ pulled)
+    sine, cosine = length(axis), float(chord @ pulled)
     q = world.needle_pose.quaternion
     if sine > 1e-12:
         q = quaternion_multiply(quaternion_from_axis_angle(axis, math.atan2(sine, cosine)), q)

@@ -115,7 +115,8 @@ class World:
     jaws: list[Jaw]
     tissue: Tissue | None = None
     solver: Equilibrium | None = None
-    walls: dict[tuple[int, str], np.ndarray] = field(default_factory=dict)  # (vessel, wall) → triangles (f, 3)
+    surface: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), np.int32))  # (f, 3) triangles of all walls
+    part: dict[tuple[int, str], tuple[int, int]] = field(default_factory=dict)  # (vessel, wall) → its rows of these
     needle: Needle | None = None
     needle_pose: Rigid = field(default_factory=Rigid.identity)
     thread: ThreadModel | None = None
@@ -146,6 +147,11 @@ class World:
     def way_in_world(self, direction: Array) -> tuple[float, float, float]:
         """A direction (3,) of the scene as an event stores it."""
         return vector(self.world_from_scene.rotate(direction))
+
+    def wall(self, vessel: int, wall: str) -> np.ndarray:
+        """The triangles (f, 3) of one wall."""
+        first, last = self.part[vessel, wall]
+        return self.surface[first:last]
 
     def open_holes(self) -> list[Hole]:
         return [h for h in self.holes if h.open]
