@@ -23,6 +23,8 @@ from trainer.geometry import Array
 SINGULAR = 1e-9
 #: Columns that the factorisation subtracts from a later one at once.
 GROUP = 4
+#: The substitutions' loops run over multiples of this many numbers, with none left over.
+STRETCH = 32
 #: The largest number in a column of a kept factor.
 LARGEST = 32767.0
 
@@ -208,7 +210,7 @@ def room(links: np.ndarray, order: np.ndarray, node_count: int) -> tuple[Band, B
     ends = ends[np.all(ends >= 0, axis=1)]
     reach = int(np.max(np.abs(ends[:, 1] - ends[:, 0]), initial=0))
     size = 3 * len(order)
-    b = min(3 * reach + 2, size - 1)
+    b = STRETCH * -(-3 * reach // STRETCH) + 2
     # Written now: a page of memory that is touched for the first time costs time, milliseconds for these.
     band = Band(np.ascontiguousarray(links), place, np.full((size, b + 1 + GROUP), 0.0), np.zeros(size))
     columns = np.full((size, b), 0, dtype=np.int16)
