@@ -84,11 +84,11 @@ def test_lost_lines_are_counted_and_a_restart_is_none() -> None:
 
 
 def test_random_bytes_for_as_long_as_asked() -> None:
-    """Memory stays that of one line. TRAINER_FUZZ_S seconds; 1 by default."""
+    """Memory stays that of one line. TRAINER_FUZZ_S seconds; 10 by default."""
     rng = np.random.default_rng(29)
     parser = LineParser()
     raw = np.frombuffer(encode(1, 2, 3, 4) * 20, dtype=np.uint8)
-    ends = time.monotonic() + float(os.environ.get("TRAINER_FUZZ_S", "1"))
+    ends = time.monotonic() + float(os.environ.get("TRAINER_FUZZ_S", "10"))
     while time.monotonic() < ends:
         data = raw.copy()
         hit = rng.random(len(data)) < rng.choice([0.001, 0.03, 1.0])

@@ -151,10 +151,10 @@ def test_no_command_bytes_raise_or_pile_up(pieces: list[bytes], ready: bool) -> 
 
 
 def test_random_commands_for_as_long_as_asked() -> None:
-    """TRAINER_FUZZ_S seconds; 2 by default."""
+    """TRAINER_FUZZ_S seconds; 10 by default."""
     rng = np.random.default_rng(23)
     f = configured()
-    ends = time.monotonic() + float(os.environ.get("TRAINER_FUZZ_S", "2"))
+    ends = time.monotonic() + float(os.environ.get("TRAINER_FUZZ_S", "10"))
     table = np.frombuffer(bytes(ARGUMENTS) + b"\xf1\xf2\xa0", dtype=np.uint8)
     now = 2.0
     while time.monotonic() < ends:

@@ -284,10 +284,10 @@ def test_fewer_than_fifteen_splices_are_believed_in_two_thousand_bursts() -> Non
 
 
 def test_random_bytes_for_as_long_as_asked() -> None:
-    """Memory stays that of one record. TRAINER_FUZZ_S seconds; 2 by default."""
+    """Memory stays that of one record. TRAINER_FUZZ_S seconds; 10 by default."""
     rng = np.random.default_rng(17)
     p = parser(1, 2)
-    ends = time.monotonic() + float(os.environ.get("TRAINER_FUZZ_S", "2"))
+    ends = time.monotonic() + float(os.environ.get("TRAINER_FUZZ_S", "10"))
     raw = np.frombuffer(record((100, 0, 0)) * 40, dtype=np.uint8)
     while time.monotonic() < ends:
         data = raw.copy()
