@@ -18,6 +18,11 @@ from trainer.geometry import Array
 
 #: A segment shorter than this, mm, has no direction of its own; below it a thread's pull turns no further.
 SHORTEST_MM = 1e-6
+#: What a solve is given, in the order in which it is looked through.
+NUMBERS = (
+    "an anchor's target", "an anchor's stiffness", "a cable's place", "a cable's length", "a friction's place",
+    "a friction's direction", "a friction's stiffness", "a friction's limit",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -95,18 +100,13 @@ def flatten(anchors: Anchors, cables: tuple[Cable, ...], frictions: Frictions) -
         cable_place[last - size : last] = cable.place
     cable_place[cable_slot >= 0] = 0.0
     length = np.array([c.length_mm for c in cables], dtype=np.float64)
-    for name, values in (
-        ("an anchor's target", anchors.target),
-        ("an anchor's stiffness", anchors.stiffness),
-        ("a cable's place", cable_place),
-        ("a cable's length", length),
-        ("a friction's place", frictions.place),
-        ("a friction's direction", frictions.along),
-        ("a friction's stiffness", frictions.stiffness),
-        ("a friction's limit", frictions.limit),
-    ):
-        if not all_finite(values):
-            raise ValueError(f"{name} is not finite")
+    numbers = (
+        anchors.target, anchors.stiffness, cable_place, length, frictions.place, frictions.along, frictions.stiffness,
+        frictions.limit,
+    )  # fmt: skip
+    bad = first_not_finite(*numbers)
+    if bad >= 0:
+        raise ValueError(f"{NUMBERS[bad]} is not finite")
     if any(n < 2 for n in count):
         raise ValueError("a cable needs at least two points")
     on_anchors, on_cables, rubbed = anchors.slot.tolist(), cable_slot.tolist(), frictions.slot.tolist()
@@ -128,6 +128,22 @@ def flatten(anchors: Anchors, cables: tuple[Cable, ...], frictions: Frictions) -
         rub_stiffness=frictions.stiffness,
         rub_limit=frictions.limit,
     )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def first_not_finite(
+    target: Array, stiffness: Array, cable: Array, length: Array, place: Array, along: Array, rub: Array, limit: Array
+) -> int:
+    """Which of the arrays, counted from 0, is the first with a number that is not finite; -1 if none: one call for all
+    that a solve is given."""
+    checks = (
+        all_finite(target), all_finite(stiffness), all_finite(cable), all_finite(length), all_finite(place),
+        all_finite(along), all_finite(rub), all_finite(limit),
+    )  # fmt: skip
+    for k in range(len(checks)):
+        if not checks[k]:
+            return k
+    return -1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -168,16 +168,18 @@ def substitute_backwards(columns: np.ndarray, unit: np.ndarray, v: np.ndarray) -
 def gather(values: Array, order: np.ndarray, v: np.ndarray) -> None:
     """``v`` (3 f,) takes the rows ``order`` of ``values`` (n, 3)."""
     for p in range(len(order)):
+        node = np.uintp(order[p])  # see links.add_forces
         for c in range(3):
-            v[3 * p + c] = values[order[p], c]
+            v[3 * p + c] = values[node, c]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def scatter(v: np.ndarray, order: np.ndarray, values: Array) -> None:
     """The rows ``order`` of ``values`` (n, 3) take ``v`` (3 f,)."""
     for p in range(len(order)):
+        node = np.uintp(order[p])
         for c in range(3):
-            values[order[p], c] = v[3 * p + c]
+            values[node, c] = v[3 * p + c]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -120,25 +120,15 @@ class Equilibrium:
         frictions = Frictions.none() if frictions is None else frictions
         groups = self._groups(anchors, cables, frictions)
         self._rest(groups)
-        found = Result(True, 0, 0.0, 1.0, np.zeros((len(anchors.slot), 3)), np.zeros(len(cables)), 0.0)
         targets: dict[int, Array] = {}
         tension: dict[tuple[int, ...], float] = {}
-        for group in groups:
-            part = self._solve(group, anchors, cables, frictions, tolerance_mN, max_iterations, targets, tension)
-            found.anchor_force[group.anchors] = part.anchor_force
-            found.tension[group.cables] = part.tension
-            found = Result(
-                converged=found.converged and part.converged,
-                iterations=found.iterations + part.iterations,
-                residual_mN=math.hypot(found.residual_mN, part.residual_mN),
-                reached=min(found.reached, part.reached),
-                anchor_force=found.anchor_force,
-                tension=found.tension,
-                cable_error_mm=max(found.cable_error_mm, part.cable_error_mm),
-            )
+        parts = [
+            self._solve(group, anchors, cables, frictions, tolerance_mN, max_iterations, targets, tension)
+            for group in groups
+        ]
         self.compliance.advance()
         self._last_target, self._tension = targets, tension
-        return found
+        return parts[0] if len(parts) == 1 else _together(groups, parts, len(anchors.slot), len(cables))
 
     def _solve(
         self,
@@ -194,10 +184,11 @@ class Equilibrium:
         on_cables = [self._bodies_of(cable.slot[cable.slot >= 0]) for cable in cables]
         if not all(on_cables):
             raise ValueError("a cable runs through no material point")
-        groups: list[set[int]] = []
-        for joined in [*({b} for b in on_anchors), *({b} for b in rubbed), *map(set, on_cables)]:
-            apart = [g for g in groups if not g & joined]
-            groups = [*apart, joined.union(*(g for g in groups if g & joined))]
+        joined = [set(through) for through in on_cables]
+        groups = [{b} for b in {*on_anchors, *rubbed}.difference(*joined)]
+        for bodies in joined:
+            apart = [g for g in groups if not g & bodies]
+            groups = [*apart, bodies.union(*(g for g in groups if g & bodies))]
         return [
             _Group(
                 bodies=sorted(group),
@@ -259,6 +250,22 @@ class Equilibrium:
         for n, cable in enumerate(cables):
             held.multiplier[n] = self._tension.get(_key(cable), 0.0)
         return held
+
+
+def _together(groups: list[_Group], parts: list[Result], anchors: int, cables: int) -> Result:
+    """What was found for each of the groups, as one."""
+    force, tension = np.zeros((anchors, 3)), np.zeros(cables)
+    for group, part in zip(groups, parts, strict=True):
+        force[group.anchors], tension[group.cables] = part.anchor_force, part.tension
+    return Result(
+        converged=all(part.converged for part in parts),
+        iterations=sum(part.iterations for part in parts),
+        residual_mN=math.hypot(*(part.residual_mN for part in parts)),
+        reached=min((part.reached for part in parts), default=1.0),
+        anchor_force=force,
+        tension=tension,
+        cable_error_mm=max((part.cable_error_mm for part in parts), default=0.0),
+    )
 
 
 def _key(cable: Cable) -> tuple[int, ...]:

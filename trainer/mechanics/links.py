@@ -94,7 +94,7 @@ def add_forces(
     """Adds the forces of the links ``first`` … ``last`` - 1 to ``force`` (n, 3) mN; returns their energy, mN mm."""
     energy = 0.0
     for e in range(first, last):
-        i, j = links[e, 0], links[e, 1]
+        i, j = np.uintp(links[e, 0]), np.uintp(links[e, 1])  # a signed index is tested for being negative each time
         dx, dy, dz = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
         length = math.sqrt(dx * dx + dy * dy + dz * dz)
         stretch = length - rest_length[e]
