@@ -98,9 +98,10 @@ def test_a_free_body_keeps_its_mean_place_and_loses_energy(seed: int) -> None:
     np.testing.assert_allclose(state.u.sum(axis=1, dtype=np.float64), mean, atol=20 * len(soft) * 4 * EPS * 5)
 
 
-@given(seeds)
-def test_both_kernels_agree_on_one_linear_material(seed: int) -> None:
-    """The one that asks each link, on the same material twice. Single against double precision, 10 roundings each."""
+@given(seeds, st.booleans())
+def test_both_kernels_agree_on_one_linear_material(seed: int, narrow: bool) -> None:
+    """The one that asks each link, on the same material twice, in all of the volume and in a part that five sweeps
+    leave narrower than half of it. Single against double precision, 10 roundings each."""
     rng = np.random.default_rng(seed)
     labels = random_shape(seed, (5, 4, 40), 0.2, 0.1, soft=2)
     of = material()
@@ -113,7 +114,10 @@ def test_both_kernels_agree_on_one_linear_material(seed: int) -> None:
     for volume in (two, one):
         state = start(volume)
         state.u[:] = u
-        everything_awake(volume, state)
+        if narrow:
+            wake(state, np.array([1, 1, 12], np.int32), np.array([3, 2, 19], np.int32))
+        else:
+            everything_awake(volume, state)
         for _ in range(5):
             sweep(volume, state, 0.01)
         results.append(state.u)

@@ -40,25 +40,43 @@ STILL = 1e-5
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _smooth_run(u, here, left, right, below, above, behind, ahead, links, wx, wy, wz, still):  # type: ignore[no-untyped-def]
-    """A run of elements: ``u`` is where they go, the rest where they and their neighbours were; returns how many went
-    further than ``still``. Where a link is missing the value that stands for the neighbour is not used."""
-    none = np.float32(0.0)
-    for k in range(len(u)):
-        x, bits = here[k], links[k]
-        pull = wx * ((ahead[k] - x if bits & 1 else none) + (behind[k] - x if bits & 2 else none))
-        pull += wy * ((above[k] - x if bits & 4 else none) + (below[k] - x if bits & 8 else none))
-        pull += wz * ((right[k] - x if bits & 16 else none) + (left[k] - x if bits & 32 else none))
-        u[k] = x + (pull if bits & FREE else none)
+def _has(bits, bit):  # type: ignore[no-untyped-def]
+    """Whether a bit is set; in 8 bits, so that 16 elements are asked at once."""
+    return np.uint8(bits & bit) != np.uint8(0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _smooth_run(u, ahead, links, first, nz, wx, wy, wz, now, other, still):  # type: ignore[no-untyped-def]
+    """A run of elements to where they go; returns how many went further than ``still``.
+
+    ``now`` has where their plane was and ``other`` the one before; there the run begins at ``first``. ``ahead`` is the
+    next plane's, which ``other`` keeps. Where a link is missing the value that stands for the neighbour is not used.
+    """
+    none, one = np.float32(0.0), np.uint64(1)
+    for k in range(np.uint64(len(u))):
+        m = k + first
+        x, to, back, bits = now[m], ahead[k], other[m], links[k]
+        pull = wx * ((to - x if _has(bits, 1) else none) + (back - x if _has(bits, 2) else none))
+        pull += wy * ((now[m + nz] - x if _has(bits, 4) else none) + (now[m - nz] - x if _has(bits, 8) else none))
+        pull += wz * ((now[m + one] - x if _has(bits, 16) else none) + (now[m - one] - x if _has(bits, 32) else none))
+        u[k] = x + (pull if _has(bits, FREE) else none)
+        other[m] = to
     moving = 0
     if still > none:
-        for k in range(len(u)):
-            moving += 1 if abs(u[k] - here[k]) > still else 0
+        for k in range(np.uint64(len(u))):
+            moving += 1 if abs(u[k] - now[k + first]) > still else 0
     return moving
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def smooth(u, links, shape, box, wx, wy, wz, still, before, now, last):  # type: ignore[no-untyped-def]
+def _keep(plane, u, begin, end):  # type: ignore[no-untyped-def]
+    """Copy the elements ``begin`` to ``end`` of a plane."""
+    for k in range(begin, end):
+        plane[k] = u[k]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def smooth(u, links, shape, box, wx, wy, wz, still, before, last, now):  # type: ignore[no-untyped-def]
     """A sweep of one component ``u`` (n,) of one linear material; returns how many went further than ``still`` mm.
 
     ``wx``, ``wy`` and ``wz`` are the parts of the difference to each neighbour by which an element moves. ``before``
@@ -68,23 +86,28 @@ def smooth(u, links, shape, box, wx, wy, wz, still, before, now, last):  # type:
     """
     _, ny, nz = shape
     plane, margin = ny * nz, nz + 1
+    inside = slice(margin, margin + plane)
     i0, i1, j0, j1, k0, k1 = box
     one = 2 * (k1 + 1 - k0) > nz
+    begin, end = j0 * nz + k0, j1 * nz + k1 + 1
+    low, high = max(begin - margin, 0), min(end + margin, plane)
+    _keep(now[inside], u[i0 * plane : (i0 + 1) * plane], low, high)
+    other = before
     moving = 0
     for i in range(i0, i1 + 1):
-        now[margin : margin + plane] = u[i * plane : (i + 1) * plane]
-        following = last[margin : margin + plane] if i == i1 else u[(i + 1) * plane : (i + 2) * plane]
+        here = u[i * plane : (i + 1) * plane]
+        bits = links[i * plane : (i + 1) * plane]
+        following = last[inside] if i == i1 else u[(i + 1) * plane : (i + 2) * plane]
         for j in range(j0, j0 + 1 if one else j1 + 1):
             a = j * nz + k0
-            b = j1 * nz + k1 + 1 if one else j * nz + k1 + 1
+            b = end if one else j * nz + k1 + 1
             moving += _smooth_run(
-                u[i * plane + a : i * plane + b], now[a + margin : b + margin],
-                now[a + margin - 1 : b + margin - 1], now[a + margin + 1 : b + margin + 1],
-                now[a + margin - nz : b + margin - nz], now[a + margin + nz : b + margin + nz],
-                before[a + margin : b + margin], following[a:b],
-                links[i * plane + a : i * plane + b], wx, wy, wz, still,
+                here[a:b], following[a:b], bits[a:b], np.uint64(a + margin), np.uint64(nz), wx, wy, wz, now, other,
+                still,
             )  # fmt: skip
-        before, now = now, before
+        _keep(other[inside], following, low, begin if one else high)
+        _keep(other[inside], following, end if one else high, high)
+        now, other = other, now
     return moving
 
 
@@ -99,7 +122,7 @@ def _pull(u, e, x, d, c, there, links, labels, material_of, law, h, area, stride
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def answer(u, links, labels, material_of, shape, strides, box, c, law, h, area, rest, part, still, before, now, last):  # type: ignore[no-untyped-def]
+def answer(u, links, labels, material_of, shape, strides, box, c, law, h, area, rest, part, still, before, last, now):  # type: ignore[no-untyped-def]
     """A sweep of component ``c`` for any laws and materials; like :func:`smooth`, but asks each link.
 
     ``rest`` (m, 3, 3) is the stiffness at rest and ``part`` (m,) how much of the way an element goes.
@@ -109,7 +132,7 @@ def answer(u, links, labels, material_of, shape, strides, box, c, law, h, area, 
     i0, i1, j0, j1, k0, k1 = box
     moving = 0
     for i in range(i0, i1 + 1):
-        now[margin : margin + plane] = u[i * plane : (i + 1) * plane]
+        _keep(now[margin : margin + plane], u[i * plane : (i + 1) * plane], max(j0 - 1, 0) * nz, min(j1 + 2, ny) * nz)
         for j in range(j0, j1 + 1):
             for k in range(k0, k1 + 1):
                 e = i * plane + j * nz + k
@@ -163,38 +186,34 @@ def sweep(volume: Volume, state: VolumeState, step_s: float, look: bool = True) 
     """One sweep of the region that is awake; ``look`` asks whether anything still moves."""
     if state.awake is None:
         return
-    size = np.array(volume.shape)
-    lowest, highest = np.maximum(state.awake[0] - 1, 0), np.minimum(state.awake[1] + 1, size - 1)
+    lowest = np.maximum(state.awake[0] - 1, 0)
+    highest = np.minimum(state.awake[1] + 1, np.array(volume.shape, np.int32) - 1)
     box = np.stack([lowest, highest], axis=1).ravel().astype(np.int64)
     rest = rest_stiffness(volume)
     part = np.array([-math.expm1(-step_s / m.time_constant_s) for m in volume.materials])
-    whole = 2.0 * np.einsum("mac,a->mc", rest, size > 1)
+    whole = 2.0 * rest[:, np.array(volume.shape) > 1].sum(axis=1)
     seams = _seam_ways(volume, state, rest, part, whole)
     still = STILL * min(volume.spacing_mm) if look else 0.0
-    h = np.array(volume.spacing_mm)
-    law, strides = constants(volume), grid_strides(volume)[:6]
-    linear = not law[:, 2:5:2].any()
-    pieces = parts(int(box[0]), int(box[1]) + 1, int(np.prod(box[1::2] - box[0::2] + 1)))
-    edges = [
-        [(_plane(volume, state.u[c], begin - 1), _plane(volume, state.u[c], end)) for begin, end in pieces]
-        for c in range(3)
-    ]
+    linear = not any(m.steepness or m.straight_from < math.inf or m.yield_strain for m in volume.materials)
+    pieces = parts(int(box[0]), int(box[1]) + 1, int(np.prod(highest - lowest + 1, dtype=np.int64)))
+    edges = {piece: [_edges(volume, u, *piece) for u in state.u] for piece in pieces}
+    h, law, strides = np.array(volume.spacing_mm), constants(volume), grid_strides(volume)[:6]
+    ways = (part[0] * rest[0] / whole[0]).astype(np.float32)
 
     def slab(piece: tuple[int, int]) -> int:
         own = np.array([piece[0], piece[1] - 1, *box[2:]])
         moving = 0
-        for c in range(3):
-            before, last = edges[c][pieces.index(piece)]
-            now = np.zeros_like(before)
+        for c, (before, last) in enumerate(edges[piece]):
+            now = np.empty_like(before)
             if linear and len(volume.materials) == 1:
-                wx, wy, wz = (np.float32(part[0] * rest[0, axis, c] / whole[0, c]) for axis in range(3))
+                wx, wy, wz = ways[:, c]
                 moving += smooth(
-                    state.u[c], state.links, volume.shape, own, wx, wy, wz, np.float32(still), before, now, last
+                    state.u[c], state.links, volume.shape, own, wx, wy, wz, np.float32(still), before, last, now
                 )
             else:
                 moving += answer(
                     state.u[c], state.links, volume.labels.reshape(-1), volume.material_of, volume.shape, strides, own,
-                    c, law, h, volume.element_mm3 / h, rest, part, still, before, now, last,
+                    c, law, h, volume.element_mm3 / h, rest, part, still, before, last, now,
                 )  # fmt: skip
         return moving
 
@@ -204,17 +223,20 @@ def sweep(volume: Volume, state: VolumeState, step_s: float, look: bool = True) 
             for c in range(3):
                 np.add.at(state.u[c], state.seams.ends[:, end], seams[:, end, c])
         moving += int(np.count_nonzero(np.abs(seams) > still))
-    wake(state, lowest.astype(np.int32), highest.astype(np.int32))
+    wake(state, lowest, highest)
     if look and moving == 0:
         state.awake = None
 
 
-def _plane(volume: Volume, u: Singles, i: int) -> Singles:
-    """A copy of plane ``i`` with a margin; zeros outside the volume, where no link leads."""
+def _edges(volume: Volume, u: Singles, begin: int, end: int) -> Singles:
+    """Copies (2, ·) of the planes before ``begin`` and at ``end``, with margins; outside the volume leads no link."""
     nx, ny, nz = volume.shape
-    out = np.zeros(ny * nz + 2 * (nz + 1), dtype=np.float32)
-    if 0 <= i < nx:
-        out[nz + 1 : nz + 1 + ny * nz] = u[i * ny * nz : (i + 1) * ny * nz]
+    inside = slice(nz + 1, nz + 1 + ny * nz)
+    out = np.empty((2, ny * nz + 2 * (nz + 1)), dtype=np.float32)
+    if begin > 0:
+        out[0, inside] = u[(begin - 1) * ny * nz : begin * ny * nz]
+    if end < nx:
+        out[1, inside] = u[end * ny * nz : (end + 1) * ny * nz]
     return out
 
 
