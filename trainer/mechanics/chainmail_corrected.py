@@ -39,6 +39,7 @@ class Ring:
         return cls(np.empty(n, np.int32), np.zeros(n, np.uint8))
 
 
+# Indices are unsigned: a signed one is asked at each use whether it counts from the end, a third of the time.
 @njit(cache=True, nogil=True, error_model="numpy")
 def by_correction(  # type: ignore[no-untyped-def]
     u0, u1, u2, links, labels, material_of, materials, mark, moved, strides, bound, way, slack, queue, begin, tail,
@@ -48,28 +49,30 @@ def by_correction(  # type: ignore[no-untyped-def]
 
     ``way`` (3,) float32 is 1, -1 or 0 for each component, and ``bound`` (r, 3) the limit that it can meet on that way.
     """
-    n = len(ring)
-    first, waiting = 0, 0
-    for head in range(begin, tail):
+    index, one = np.uint64, np.uint64(1)
+    n, tail = index(len(ring)), index(tail)
+    first, waiting = index(0), index(0)
+    for head in range(index(begin), tail):
         ring[waiting] = queue[head]
-        waiting += 1
+        waiting += one
     wx, wy, wz = way[0], way[1], way[2]
-    while waiting > 0:
-        s = ring[first]
-        first = first + 1 if first + 1 < n else 0
-        waiting -= 1
+    while waiting > index(0):
+        s = index(ring[first])
+        first = first + one if first + one < n else index(0)
+        waiting -= one
         if waits[s] != HELD:
             waits[s] = 0
-        a = np.int64(material_of[labels[s]])
+        rows = index(material_of[labels[s]]) * index(materials)
         sx, sy, sz = u0[s], u1[s], u2[s]
-        for d in range(6):
-            if links[s] & (1 << d) == 0:
+        bits = links[s]
+        for d in range(index(6)):
+            if bits & (one << d) == 0:
                 continue
-            e = s + strides[d]
+            e = index(np.int64(s) + strides[d])
             if links[e] & FREE == 0 or waits[e] == HELD:
                 continue
-            row = (a * materials + material_of[labels[e]]) * 6 + d
-            tx, ty, tz = sx + bound[row, 0], sy + bound[row, 1], sz + bound[row, 2]
+            row = (rows + index(material_of[labels[e]])) * index(6) + d
+            tx, ty, tz = sx + bound[row, index(0)], sy + bound[row, one], sz + bound[row, index(2)]
             go_x, go_y, go_z = (tx - u0[e]) * wx > slack, (ty - u1[e]) * wy > slack, (tz - u2[e]) * wz > slack
             if not (go_x | go_y | go_z):
                 continue
@@ -82,10 +85,10 @@ def by_correction(  # type: ignore[no-untyped-def]
             if mark[e] != moved:
                 mark[e] = moved
                 queue[tail] = e
-                tail += 1
+                tail += one
             if waits[e] == 0:
                 waits[e] = NEXT
                 last = first + waiting
                 ring[last if last < n else last - n] = e
-                waiting += 1
-    return tail
+                waiting += one
+    return np.int64(tail)

@@ -92,30 +92,33 @@ def _beyond(apart, low, high):  # type: ignore[no-untyped-def]
 
 
 # Entries are put and taken in place here: arrays handed to a function are counted on the way in and out, which in this
-# loop took longer than all the rest.
+# loop took longer than all the rest. Indices are unsigned: a signed one is asked at each use whether it counts from the
+# end.
 @njit(cache=True, nogil=True, error_model="numpy")
 def by_violation(  # type: ignore[no-untyped-def]
     u0, u1, u2, links, labels, material_of, materials, mark, moved, strides, low, high, queue, begin, tail,
     element, key, via, least, asked, following, buckets, one, bits,
 ):  # fmt: skip
     """Move what ``queue[begin:tail]`` asks to move, and what that asks; returns the queue's end."""
+    index = np.uint64
+    x, y, z = index(0), index(1), index(2)
     last = np.int64(0)
     free, fresh = np.int64(-1), np.int64(0)  # the first of the blocks that were given back; the first never used
-    head = begin
+    head, tail = index(begin), index(tail)
     while True:
         while head < tail:  # the neighbours that a moved element asks to move wait
-            s = queue[head]
-            head += 1
-            a = np.int64(material_of[labels[s]])
-            for d in range(6):
-                e = s + strides[d]
-                if links[s] & (1 << d) == 0 or mark[e] == moved or links[e] & FREE == 0:
+            s = index(queue[head])
+            head += y
+            rows = index(material_of[labels[s]]) * index(materials)
+            for d in range(index(6)):
+                e = index(np.int64(s) + strides[d])
+                if links[s] & (y << d) == 0 or mark[e] == moved or links[e] & FREE == 0:
                     continue
-                row = (a * materials + material_of[labels[e]]) * 6 + d
+                row = (rows + index(material_of[labels[e]])) * index(6) + d
                 v = max(
-                    _beyond(u0[e] - u0[s], low[row, 0], high[row, 0]), _beyond(u1[e] - u1[s], low[row, 1], high[row, 1])
+                    _beyond(u0[e] - u0[s], low[row, x], high[row, x]), _beyond(u1[e] - u1[s], low[row, y], high[row, y])
                 )
-                v = max(v, _beyond(u2[e] - u2[s], low[row, 2], high[row, 2]))
+                v = max(v, _beyond(u2[e] - u2[s], low[row, z], high[row, z]))
                 if v <= np.float32(0.0):
                     continue
                 one[0] = v
@@ -123,71 +126,72 @@ def by_violation(  # type: ignore[no-untyped-def]
                 if asked[e] == moved and least[e] <= k:
                     continue
                 asked[e], least[e] = moved, k
-                b = _bucket(k, last)
-                block = np.int64(buckets[b, 0])
-                if block < 0 or buckets[b, 1] == BLOCK:
+                b = index(_bucket(k, last))
+                block = np.int64(buckets[b, x])
+                if block < 0 or buckets[b, y] == BLOCK:
                     new = free if free >= 0 else fresh
                     if free >= 0:
-                        free = np.int64(following[free])
+                        free = np.int64(following[index(free)])
                     else:
                         fresh += 1
-                    following[new] = block
-                    buckets[b, 0], buckets[b, 1] = new, 0
+                    following[index(new)] = block
+                    buckets[b, x], buckets[b, y] = new, 0
                     block = new
-                at = block * BLOCK + buckets[b, 1]
+                at = index(block * BLOCK + buckets[b, y])
                 element[at], key[at], via[at] = e, k, d
-                buckets[b, 1] += 1
+                buckets[b, y] += 1
         b = 0
         while b < BUCKETS and buckets[b, 0] < 0:
             b += 1
         if b == BUCKETS:
-            return tail
+            return np.int64(tail)
         block, count = np.int64(buckets[b, 0]), np.int64(buckets[b, 1])
         if b > 0:  # the largest violation that waits: its bucket is sorted anew by how the others differ from it
             last = np.int64(LARGEST)
             old, size = block, count
             while old >= 0:
-                for at in range(old * BLOCK, old * BLOCK + size):
+                for at in range(index(old * BLOCK), index(old * BLOCK + size)):
                     last = min(last, np.int64(key[at]))
-                old, size = np.int64(following[old]), np.int64(BLOCK)
+                old, size = np.int64(following[index(old)]), np.int64(BLOCK)
             buckets[b, 0] = -1
             old, size = block, count
             while old >= 0:
-                for at in range(old * BLOCK, old * BLOCK + size):
-                    if mark[element[at]] == moved:
+                for at in range(index(old * BLOCK), index(old * BLOCK + size)):
+                    if mark[index(element[at])] == moved:
                         continue
-                    b = _bucket(np.int64(key[at]), last)
-                    block = np.int64(buckets[b, 0])
-                    if block < 0 or buckets[b, 1] == BLOCK:
+                    b = index(_bucket(np.int64(key[at]), last))
+                    block = np.int64(buckets[b, x])
+                    if block < 0 or buckets[b, y] == BLOCK:
                         new = free if free >= 0 else fresh
                         if free >= 0:
-                            free = np.int64(following[free])
+                            free = np.int64(following[index(free)])
                         else:
                             fresh += 1
-                        following[new] = block
-                        buckets[b, 0], buckets[b, 1] = new, 0
+                        following[index(new)] = block
+                        buckets[b, x], buckets[b, y] = new, 0
                         block = new
-                    to = block * BLOCK + buckets[b, 1]
+                    to = index(block * BLOCK + buckets[b, y])
                     element[to], key[to], via[to] = element[at], key[at], via[at]
-                    buckets[b, 1] += 1
-                done, old, size = old, np.int64(following[old]), np.int64(BLOCK)
-                following[done] = free
+                    buckets[b, y] += 1
+                done, old, size = old, np.int64(following[index(old)]), np.int64(BLOCK)
+                following[index(done)] = free
                 free = done
             continue
-        at = block * BLOCK + count - 1
+        at = index(block * BLOCK + count - 1)
         buckets[0, 1] = count - 1
         if count == 1:
-            buckets[0, 0], buckets[0, 1] = following[block], BLOCK
-            following[block] = free
+            buckets[0, 0], buckets[0, 1] = following[index(block)], BLOCK
+            following[index(block)] = free
             free = block
-        e = np.int64(element[at])
+        e = index(element[at])
         if mark[e] == moved:
             continue
-        s = e - strides[via[at]]
-        row = (np.int64(material_of[labels[s]]) * materials + material_of[labels[e]]) * 6 + via[at]
-        u0[e] = min(max(u0[e], u0[s] + low[row, 0]), u0[s] + high[row, 0])
-        u1[e] = min(max(u1[e], u1[s] + low[row, 1]), u1[s] + high[row, 1])
-        u2[e] = min(max(u2[e], u2[s] + low[row, 2]), u2[s] + high[row, 2])
+        d = index(via[at])
+        s = index(np.int64(e) - strides[d])
+        row = (index(material_of[labels[s]]) * index(materials) + index(material_of[labels[e]])) * index(6) + d
+        u0[e] = min(max(u0[e], u0[s] + low[row, x]), u0[s] + high[row, x])
+        u1[e] = min(max(u1[e], u1[s] + low[row, y]), u1[s] + high[row, y])
+        u2[e] = min(max(u2[e], u2[s] + low[row, z]), u2[s] + high[row, z])
         mark[e] = moved
         queue[tail] = e
-        tail += 1
+        tail += y
