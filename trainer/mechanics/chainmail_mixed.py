@@ -140,26 +140,26 @@ def by_violation(  # type: ignore[no-untyped-def]
                 at = index(block * BLOCK + buckets[b, y])
                 element[at], key[at], via[at] = e, k, d
                 buckets[b, y] += 1
-        b = 0
-        while b < BUCKETS and buckets[b, 0] < 0:
-            b += 1
-        if b == BUCKETS:
+        largest = 0
+        while largest < BUCKETS and buckets[largest, 0] < 0:
+            largest += 1
+        if largest == BUCKETS:
             return np.int64(tail)
-        block, count = np.int64(buckets[b, 0]), np.int64(buckets[b, 1])
-        if b > 0:  # the largest violation that waits: its bucket is sorted anew by how the others differ from it
+        block, count = np.int64(buckets[largest, 0]), np.int64(buckets[largest, 1])
+        if largest > 0:  # the largest violation that waits: its bucket is sorted anew by how the others differ from it
             last = np.int64(LARGEST)
             old, size = block, count
             while old >= 0:
-                for at in range(index(old * BLOCK), index(old * BLOCK + size)):
-                    last = min(last, np.int64(key[at]))
+                for from_ in range(index(old * BLOCK), index(old * BLOCK + size)):
+                    last = min(last, np.int64(key[from_]))
                 old, size = np.int64(following[index(old)]), np.int64(BLOCK)
-            buckets[b, 0] = -1
+            buckets[largest, 0] = -1
             old, size = block, count
             while old >= 0:
-                for at in range(index(old * BLOCK), index(old * BLOCK + size)):
-                    if mark[index(element[at])] == moved:
+                for from_ in range(index(old * BLOCK), index(old * BLOCK + size)):
+                    if mark[index(element[from_])] == moved:
                         continue
-                    b = index(_bucket(np.int64(key[at]), last))
+                    b = index(_bucket(np.int64(key[from_]), last))
                     block = np.int64(buckets[b, x])
                     if block < 0 or buckets[b, y] == BLOCK:
                         new = free if free >= 0 else fresh
@@ -171,24 +171,23 @@ def by_violation(  # type: ignore[no-untyped-def]
                         buckets[b, x], buckets[b, y] = new, 0
                         block = new
                     to = index(block * BLOCK + buckets[b, y])
-                    element[to], key[to], via[to] = element[at], key[at], via[at]
+                    element[to], key[to], via[to] = element[from_], key[from_], via[from_]
                     buckets[b, y] += 1
                 done, old, size = old, np.int64(following[index(old)]), np.int64(BLOCK)
                 following[index(done)] = free
                 free = done
             continue
-        at = index(block * BLOCK + count - 1)
+        top = index(block * BLOCK + count - 1)
         buckets[0, 1] = count - 1
         if count == 1:
             buckets[0, 0], buckets[0, 1] = following[index(block)], BLOCK
             following[index(block)] = free
             free = block
-        e = index(element[at])
+        e, side = index(element[top]), index(via[top])
         if mark[e] == moved:
             continue
-        d = index(via[at])
-        s = index(np.int64(e) - strides[d])
-        row = (index(material_of[labels[s]]) * index(materials) + index(material_of[labels[e]])) * index(6) + d
+        s = index(np.int64(e) - strides[side])
+        row = (index(material_of[labels[s]]) * index(materials) + index(material_of[labels[e]])) * index(6) + side
         u0[e] = min(max(u0[e], u0[s] + low[row, x]), u0[s] + high[row, x])
         u1[e] = min(max(u1[e], u1[s] + low[row, y]), u1[s] + high[row, y])
         u2[e] = min(max(u2[e], u2[s] + low[row, z]), u2[s] + high[row, z])
