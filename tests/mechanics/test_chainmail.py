@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from volume_samples import SPACING, block, check_structure, cut_some, material, random_shape, seeds, worst_violation
 
+from trainer.mechanics.chainmail_scan import RUN
 from trainer.mechanics.volume import FREE, Volume, VolumeError, VolumeState, build, places, start, tack
 from trainer.mechanics.volume_drag import drag
 
@@ -110,6 +111,21 @@ def test_both_methods_agree_in_any_shape(seed: int, held_count: int) -> None:
         assert np.array_equal(done[0].lowest, done[1].lowest)
         assert np.array_equal(done[0].highest, done[1].highest)
         check_structure(volume, states[0])
+
+
+@pytest.mark.parametrize("void", [0.0, 0.2])
+def test_both_methods_agree_where_a_plane_is_longer_than_a_run(void: float) -> None:
+    """A plane of two and a half runs of the scan: whole and with holes, far and near."""
+    shape = (4, 80, 128)
+    assert 2 * RUN < shape[1] * shape[2] < 3 * RUN
+    volume = build(random_shape(0, shape, void), SPACING, {1: material()})
+    states = [start(volume), start(volume)]
+    held = np.flatnonzero(volume.labels.reshape(-1)).astype(np.int32)[1000:1001]
+    for pull in (90.0, 5.0, -1.0):
+        for state, method in zip(states, METHODS, strict=True):
+            assert drag(volume, state, held, (pull, -0.5 * pull, 0.2), method).method == method
+        assert np.array_equal(states[0].u, states[1].u)
+        assert np.array_equal(states[0].mark, states[1].mark)
 
 
 def test_the_extent_is_that_of_what_moved() -> None:

@@ -21,66 +21,66 @@ from trainer.mechanics.volume import FREE
 #: Elements of a plane that go through all planes together: they and those before fit into a cache of 1 MB.
 SHARE = 65536
 #: Elements that are looked at together: if all are to be considered no one asks each.
-RUN = 1024
+RUN = 4096
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _all_take(mark_before, links, need, moved):  # type: ignore[no-untyped-def]
-    """Whether all (2), some (1) or none (0) of a run have a sponsor that moved, are linked to it and free."""
-    every, some = np.uint8(1), np.uint8(0)
+    """Whether all of a run have a sponsor that moved, are linked to it and free. In bytes, 64 at a time."""
+    every, differs = need, np.uint8(0)
     for k in range(len(links)):
-        take = np.uint8((mark_before[k] == moved) & ((links[k] & need) == need))
-        every &= take
-        some |= take
-    return every + some
+        every = np.uint8(every & links[k])
+        differs = np.uint8(differs | (mark_before[k] ^ moved))
+    return every == need and differs == np.uint8(0)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _follow_all(u0, u1, u2, s0, s1, s2, l0, l1, l2, h0, h1, h2, still):  # type: ignore[no-untyped-def]
-    """A run into the limits of the run before; ``still`` says with 1 who need not move."""
+def _any_moved(mark, moved):  # type: ignore[no-untyped-def]
+    """Whether any of a run moved."""
+    some = np.uint8(0)
+    for k in range(len(mark)):
+        some = np.uint8(some | np.uint8(mark[k] == moved))
+    return some != np.uint8(0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _follow_all(u0, u1, u2, s0, s1, s2, l0, l1, l2, h0, h1, h2, mark, moved):  # type: ignore[no-untyped-def]
+    """A run into the limits of the run before; marks it and returns how many moved."""
+    still = np.int32(0)
     for k in range(len(u0)):
         x, y, z = u0[k], u1[k], u2[k]
         nx = min(max(x, s0[k] + l0), s0[k] + h0)
         ny = min(max(y, s1[k] + l1), s1[k] + h1)
         nz = min(max(z, s2[k] + l2), s2[k] + h2)
-        still[k] = np.int32((nx == x) & (ny == y) & (nz == z))
+        rests = np.int32((nx == x) & (ny == y) & (nz == z))
         u0[k], u1[k], u2[k] = nx, ny, nz
+        mark[k] = np.uint8(moved + np.uint8(rests))
+        still += rests
+    return len(u0) - still
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _sum(still):  # type: ignore[no-untyped-def]
+def _follow_some(u0, u1, u2, s0, s1, s2, l0, l1, l2, h0, h1, h2, mark, mark_before, links, need, moved):  # type: ignore[no-untyped-def]
+    """The same for those that have a sponsor."""
     count = np.int32(0)
-    for k in range(len(still)):
-        count += still[k]
-    return count
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _follow_some(u0, u1, u2, s0, s1, s2, low, high, mark, mark_before, links, need, moved):  # type: ignore[no-untyped-def]
-    """The same for those that have a sponsor; marks them and returns how many moved."""
-    count = 0
     for k in range(len(u0)):
-        if mark_before[k] != moved or (links[k] & need) != need:
-            continue
         x, y, z = u0[k], u1[k], u2[k]
-        nx = min(max(x, s0[k] + low[0]), s0[k] + high[0])
-        ny = min(max(y, s1[k] + low[1]), s1[k] + high[1])
-        nz = min(max(z, s2[k] + low[2]), s2[k] + high[2])
-        if nx == x and ny == y and nz == z:
-            mark[k] = moved + 1
-        else:
-            u0[k], u1[k], u2[k] = nx, ny, nz
-            mark[k] = moved
-            count += 1
+        nx = min(max(x, s0[k] + l0), s0[k] + h0)
+        ny = min(max(y, s1[k] + l1), s1[k] + h1)
+        nz = min(max(z, s2[k] + l2), s2[k] + h2)
+        take = (mark_before[k] == moved) & (np.uint8(links[k] & need) == need)
+        rests = (nx == x) & (ny == y) & (nz == z)
+        u0[k], u1[k], u2[k] = nx if take else x, ny if take else y, nz if take else z
+        mark[k] = np.uint8(moved + np.uint8(rests)) if take else mark[k]
+        count += np.int32(take & (not rests))
     return count
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def scan(u0, u1, u2, links, mark, moved, shape, d, low, high, plane, first, last, still):  # type: ignore[no-untyped-def]
+def scan(u0, u1, u2, links, mark, moved, shape, d, low, high, plane, first, last):  # type: ignore[no-untyped-def]
     """Lines from ``plane`` in direction ``d`` (0 is +x, 1 is −x); returns how many moved and the last plane's i.
 
-    They are those of the elements ``first`` to ``last`` (not included) of a plane, j·nz + k. ``still`` is room for a
-    run, (RUN,) int32.
+    They are those of the elements ``first`` to ``last`` (not included) of a plane, j·nz + k.
     """
     nx, ny, nz = shape
     need = np.uint8(FREE | (2 >> d))  # a link back towards the sponsor
@@ -92,28 +92,20 @@ def scan(u0, u1, u2, links, mark, moved, shape, d, low, high, plane, first, last
         while 0 <= i < nx:
             in_plane = 0
             for run in range(share, min(share + SHARE, last), RUN):
-                width = min(RUN, min(share + SHARE, last) - run)
                 a = i * ny * nz + run
+                width = min(RUN, min(share + SHARE, last) - run)
                 b = a - step * ny * nz
                 here, before = slice(a, a + width), slice(b, b + width)
-                takes = _all_take(mark[before], links[here], need, moved)
-                if takes == 2:
-                    rests = still[:width]
-                    _follow_all(
+                if _all_take(mark[before], links[here], need, moved):
+                    in_plane += _follow_all(
                         u0[here], u1[here], u2[here], u0[before], u1[before], u2[before],
-                        low[0], low[1], low[2], high[0], high[1], high[2], rests,
+                        low[0], low[1], low[2], high[0], high[1], high[2], mark[here], moved,
                     )  # fmt: skip
-                    at_rest = _sum(rests)
-                    if at_rest == 0:
-                        mark[here] = moved
-                    else:
-                        for k in range(width):
-                            mark[a + k] = moved + still[k]
-                    in_plane += width - at_rest
-                elif takes == 1:
+                elif _any_moved(mark[before], moved):
                     in_plane += _follow_some(
-                        u0[here], u1[here], u2[here], u0[before], u1[before], u2[before], low, high,
-                        mark[here], mark[before], links[here], need, moved,
+                        u0[here], u1[here], u2[here], u0[before], u1[before], u2[before],
+                        low[0], low[1], low[2], high[0], high[1], high[2], mark[here], mark[before], links[here], need,
+                        moved,
                     )  # fmt: skip
             if in_plane == 0:
                 break

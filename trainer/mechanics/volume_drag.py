@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from trainer.mechanics.chainmail import cross_section, left_out, lengthwise, over_seams, spread, widen
 from trainer.mechanics.chainmail_corrected import HELD, ROUNDING, Ring, by_correction
 from trainer.mechanics.chainmail_mixed import Waiting, by_violation
-from trainer.mechanics.chainmail_scan import RUN, scan, scan_left_out
+from trainer.mechanics.chainmail_scan import scan, scan_left_out
 from trainer.mechanics.sharing import parts, share_out
 from trainer.mechanics.volume import (
     PRESENT,
@@ -133,13 +133,10 @@ def _scan(
     planes = (int(box[1]), int(box[0]))
 
     def lines(piece: tuple[int, int]) -> list[tuple[int, int]]:
-        still = np.empty(RUN, dtype=np.int32)
         return [
-            scan(
-                u0, u1, u2, state.links, state.mark, moved, volume.shape, d, low[d], high[d], planes[d], *piece, still
-            )
+            scan(u0, u1, u2, state.links, state.mark, moved, volume.shape, d, low[d], high[d], planes[d], *piece)
             for d in range(2)
-        ]  # fmt: skip
+        ]
 
     total = 0
     for (ahead, i1), (behind, i0) in share_out(lines, parts(first, last, (last - first) * volume.shape[0])):
