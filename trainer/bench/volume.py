@@ -21,7 +21,7 @@ from trainer.geometry import Array, Rigid, quaternion_from_axis_angle
 from trainer.mechanics.contact_response import push_out, surface_normals
 from trainer.mechanics.elastic_relaxation import SWEEPS, relax, sweep
 from trainer.mechanics.occupancy import OccupancyMap, surface_elements
-from trainer.mechanics.volume import Material, Volume, VolumeState, build, bytes_per_element, start, wake
+from trainer.mechanics.volume import Material, Volume, VolumeState, build, bytes_per_element, places, start, wake
 from trainer.mechanics.volume_drag import drag
 
 SIZES, QUICK_SIZES = (50, 128, 256), (50, 64)
@@ -303,7 +303,7 @@ class Bodies:
         for b, state in enumerate(self.states):
             drag(self.volume, state, _middle(self.volume), self.side * 0.3 * np.array([np.sin(0.3 * frame), 0.2, 0.1]))
             relax(self.volume, state, 0.01)
-            self._enter(2 + b, self.rest + state.u[:, self.outer].T + self.at[2 + b])
+            self._enter(2 + b, places(self.volume, state, self.outer) + self.at[2 + b])
         pairs = self.map.touching()
         self.touched = len(pairs)
         entries, by = push_out(self.points, self.facing, pairs, self.soft, self.map.cell_mm)

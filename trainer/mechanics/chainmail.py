@@ -94,18 +94,20 @@ def left_out(links, mark, moved, strides, queue, tail):  # type: ignore[no-untyp
 @njit(cache=True, nogil=True, error_model="numpy")
 def spread(u0, u1, u2, links, mark, moved, strides, low, high, queue, tail):  # type: ignore[no-untyped-def]
     """First come, first served from ``queue[:tail]``, whatever has not been considered; returns the queue's end."""
-    head = 0
-    while head < tail:
-        s = queue[head]
-        head += 1
-        for d in range(6):
-            if links[s] & (1 << d):
-                e = s + strides[d]
+    index, one = np.uint64, np.uint64(1)
+    head, end = index(0), index(tail)
+    while head < end:
+        s = index(queue[head])
+        head += one
+        bits = links[s]
+        for d in range(index(6)):
+            if bits & (one << d):
+                e = index(np.int64(s) + strides[d])
                 open_ = mark[e] | 1 != moved | 1 and links[e] & FREE
                 if open_ and consider(u0, u1, u2, mark, moved, e, s, low, high, d):
-                    queue[tail] = e
-                    tail += 1
-    return tail
+                    queue[end] = e
+                    end += one
+    return np.int64(end)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -175,9 +177,14 @@ def over_seams(u0, u1, u2, links, mark, moved, ends, low, high, back_low, back_h
 @njit(cache=True, nogil=True, error_model="numpy")
 def widen(queue, begin, tail, strides, box):  # type: ignore[no-untyped-def]
     """Widen ``box`` by the elements ``queue[begin:tail]``."""
-    for head in range(begin, tail):
-        e = queue[head]
-        i, j, k = e // strides[0], e % strides[0] // strides[2], e % strides[2]
-        box[0], box[1] = min(box[0], i), max(box[1], i)
-        box[2], box[3] = min(box[2], j), max(box[3], j)
-        box[4], box[5] = min(box[4], k), max(box[5], k)
+    index = np.uint64
+    plane, row = index(strides[0]), index(strides[2])
+    for head in range(index(begin), index(tail)):
+        e = index(queue[head])
+        i = e // plane
+        in_plane = e - i * plane
+        j = in_plane // row
+        k = in_plane - j * row
+        box[0], box[1] = min(box[0], np.int64(i)), max(box[1], np.int64(i))
+        box[2], box[3] = min(box[2], np.int64(j)), max(box[3], np.int64(j))
+        box[4], box[5] = min(box[4], np.int64(k)), max(box[5], np.int64(k))

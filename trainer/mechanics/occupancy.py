@@ -38,14 +38,14 @@ def _enter(points, first, low, per_mm, cells, head, cell, after, before):  # typ
     """Take each of ``points`` (k, 3), numbered from ``first``, to the cell that it is in now; returns how many went."""
     nx, ny, nz = cells[0], cells[1], cells[2]
     went = 0
-    for p in range(len(points)):
+    for p in range(np.uint64(len(points))):
         x = (points[p, 0] - low[0]) * per_mm
         y = (points[p, 1] - low[1]) * per_mm
         z = (points[p, 2] - low[2]) * per_mm
         # Also false for NaN: such a point is nowhere.
         inside = 0.0 <= x < nx and 0.0 <= y < ny and 0.0 <= z < nz
         to = (int(x) * ny + int(y)) * nz + int(z) if inside else -1
-        s = first + p
+        s = np.uint64(first + p)
         old = cell[s]
         if to == old:
             continue

@@ -297,7 +297,20 @@ def wake(state: VolumeState, lowest: Indices, highest: Indices) -> None:
 
 def places(volume: Volume, state: VolumeState, elements: Indices) -> Array:
     """Where ``elements`` (k,) are now: (k, 3) mm in the volume's frame."""
-    return volume.rest(elements) + state.u[:, elements].T
+    out = np.empty((len(elements), 3))
+    _places(state.u, np.asarray(elements), grid_strides(volume), np.array(volume.spacing_mm), out)
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _places(u, elements, strides, h, out):  # type: ignore[no-untyped-def]
+    plane, row = np.uint64(strides[0]), np.uint64(strides[2])
+    for m in range(len(elements)):
+        e = np.uint64(elements[m])
+        i = e // plane
+        j = (e - i * plane) // row
+        k = e - i * plane - j * row
+        out[m, 0], out[m, 1], out[m, 2] = i * h[0] + u[0, e], j * h[1] + u[1, e], k * h[2] + u[2, e]
 
 
 def tack(state: VolumeState, elements: Indices) -> None:
