@@ -24,6 +24,8 @@ SUBJECTS = {
     "hard_vessel": "Static equilibrium",
     "hard_thread": "The thread",
     "hard_contact": "Contact search",
+    "hard_volume": "Volumes of tissue",
+    "hard_scan": "Scans",
     "hard_scene": "Whole exercises",
 }
 #: How a case can end; the last is the only one that must not be.

@@ -186,7 +186,7 @@ def beyond_limits(volume: Volume, state: VolumeState) -> float:
         for c in range(3):
             apart = u[c][tuple(far)] - u[c][tuple(near)]
             low, high = volume.low[a, b, 2 * axis, c], volume.high[a, b, 2 * axis, c]
-            worst = max(worst, float(np.maximum(low - apart, apart - high).max()))
+            worst = max(worst, float(np.maximum(low - apart, apart - high).max(initial=0.0)))
     return worst
 
 

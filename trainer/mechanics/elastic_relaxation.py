@@ -186,6 +186,9 @@ def sweep(volume: Volume, state: VolumeState, step_s: float, look: bool = True) 
     """One sweep of the region that is awake; ``look`` asks whether anything still moves."""
     if state.awake is None:
         return
+    if volume.labels.size == 1:  # nothing pulls at it
+        state.awake = None
+        return
     lowest = np.maximum(state.awake[0] - 1, 0)
     highest = np.minimum(state.awake[1] + 1, np.array(volume.shape, np.int32) - 1)
     box = np.stack([lowest, highest], axis=1).ravel().astype(np.int64)
