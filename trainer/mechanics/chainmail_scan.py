@@ -22,6 +22,8 @@ from trainer.mechanics.volume import FREE
 SHARE = 65536
 #: Elements that are looked at together: if all are to be considered no one asks each.
 RUN = 4096
+#: Else they are taken by the page of memory, and a page of which none is to be considered is not written to.
+PAGE = 1024
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -35,11 +37,11 @@ def _all_take(mark_before, links, need, moved):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _any_moved(mark, moved):  # type: ignore[no-untyped-def]
-    """Whether any of a run moved."""
+def _any_take(mark_before, links, need, moved):  # type: ignore[no-untyped-def]
+    """Whether any does."""
     some = np.uint8(0)
-    for k in range(len(mark)):
-        some = np.uint8(some | np.uint8(mark[k] == moved))
+    for k in range(len(links)):
+        some = np.uint8(some | (np.uint8(mark_before[k] == moved) & np.uint8(np.uint8(links[k] & need) == need)))
     return some != np.uint8(0)
 
 
@@ -61,18 +63,19 @@ def _follow_all(u0, u1, u2, s0, s1, s2, l0, l1, l2, h0, h1, h2, mark, moved):  #
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _follow_some(u0, u1, u2, s0, s1, s2, l0, l1, l2, h0, h1, h2, mark, mark_before, links, need, moved):  # type: ignore[no-untyped-def]
-    """The same for those that have a sponsor."""
+    """The same for those that have a sponsor; for the others there are no limits."""
+    none = np.float32(np.inf)
     count = np.int32(0)
     for k in range(len(u0)):
         x, y, z = u0[k], u1[k], u2[k]
-        nx = min(max(x, s0[k] + l0), s0[k] + h0)
-        ny = min(max(y, s1[k] + l1), s1[k] + h1)
-        nz = min(max(z, s2[k] + l2), s2[k] + h2)
         take = (mark_before[k] == moved) & (np.uint8(links[k] & need) == need)
+        nx = min(max(x, s0[k] + l0 if take else -none), s0[k] + h0 if take else none)
+        ny = min(max(y, s1[k] + l1 if take else -none), s1[k] + h1 if take else none)
+        nz = min(max(z, s2[k] + l2 if take else -none), s2[k] + h2 if take else none)
         rests = (nx == x) & (ny == y) & (nz == z)
-        u0[k], u1[k], u2[k] = nx if take else x, ny if take else y, nz if take else z
+        u0[k], u1[k], u2[k] = nx, ny, nz
         mark[k] = np.uint8(moved + np.uint8(rests)) if take else mark[k]
-        count += np.int32(take & (not rests))
+        count += np.int32(not rests)
     return count
 
 
@@ -101,12 +104,16 @@ def scan(u0, u1, u2, links, mark, moved, shape, d, low, high, plane, first, last
                         u0[here], u1[here], u2[here], u0[before], u1[before], u2[before],
                         low[0], low[1], low[2], high[0], high[1], high[2], mark[here], moved,
                     )  # fmt: skip
-                elif _any_moved(mark[before], moved):
-                    in_plane += _follow_some(
-                        u0[here], u1[here], u2[here], u0[before], u1[before], u2[before],
-                        low[0], low[1], low[2], high[0], high[1], high[2], mark[here], mark[before], links[here], need,
-                        moved,
-                    )  # fmt: skip
+                    continue
+                for part in range(0, width, PAGE):
+                    here = slice(a + part, a + min(part + PAGE, width))
+                    before = slice(b + part, b + min(part + PAGE, width))
+                    if _any_take(mark[before], links[here], need, moved):
+                        in_plane += _follow_some(
+                            u0[here], u1[here], u2[here], u0[before], u1[before], u2[before],
+                            low[0], low[1], low[2], high[0], high[1], high[2], mark[here], mark[before], links[here],
+                            need, moved,
+                        )  # fmt: skip
             if in_plane == 0:
                 break
             total += in_plane
