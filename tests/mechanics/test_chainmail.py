@@ -128,6 +128,23 @@ def test_both_methods_agree_where_a_plane_is_longer_than_a_run(void: float) -> N
         assert np.array_equal(states[0].mark, states[1].mark)
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_work_grows_no_faster_than_what_moves(method: str) -> None:
+    """Only neighbours of what moves are considered, and each once: at most six for each that moved, and of larger pulls
+    a smaller share, since they are the surface of the moved: in logarithms considered against moved has a slope below 1
+    (and above 2/3, that of a surface)."""
+    volume = block((48, 48, 48))
+    moved, considered = [], []
+    for length in (0.5, 1.0, 2.0, 4.0):
+        state = start(volume)
+        moved.append(drag(volume, state, np.array([middle(volume)]), length * np.array(SPACING), method).count)
+        considered.append(np.count_nonzero(state.mark))
+    assert 0 < moved[0] < 30 < 3000 < moved[-1] < volume.labels.size // 4
+    assert all(m <= c <= 7 * m for m, c in zip(moved, considered, strict=True))
+    slope = np.polyfit(np.log(moved), np.log(considered), 1)[0]
+    assert 2.0 / 3.0 < slope < 1.0
+
+
 def test_the_extent_is_that_of_what_moved() -> None:
     for method in METHODS:
         volume = block((9, 10, 11))

@@ -210,7 +210,7 @@ def growth(side: int, frames: int) -> list[Row]:
     slope = float(np.polyfit(np.log(counts), np.log([r.median_ms for r in rows]), 1)[0])
     return [
         Row(**{**r.__dict__, "residual": slope, "residual_of": "exponent of time against elements moved, of all pulls",
-               "status": f"{count} moved"})
+               "status": f"{count} moved, {1e6 * r.median_ms / count:.0f} ns each"})
         for r, count in zip(rows, counts, strict=True)
     ]  # fmt: skip
 
