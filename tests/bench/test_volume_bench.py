@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
+from trainer.bench import volume
 from trainer.bench.volume import ORDER, Bodies, beyond_limits, block, measure, trials
 from trainer.mechanics.volume import start
 
@@ -21,6 +23,16 @@ def test_measure_has_a_row_for_each_method_and_case() -> None:
             assert row.error == 0.0
 
 
+def test_an_image_tells_its_pace_and_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """19 bytes for each of 20 × 20 × 10 elements."""
+    monkeypatch.setattr(volume, "IMAGE", (20, 20, 10))
+    monkeypatch.setattr(volume, "FREE_PART", 6)
+    rows = volume.image(2)
+    assert [(row.size, row.setting) for row in rows] == [(4000, "6³ free"), (4000, "all free")]
+    for row in rows:
+        assert "moves/s; 19 B an element, 0 MB at most" in row.status
+
+
 def test_lists_and_scan_do_not_differ() -> None:
     row = trials(5, 10)
     assert (row.error, row.residual) == (0.0, 0.0)
@@ -29,11 +41,11 @@ def test_lists_and_scan_do_not_differ() -> None:
 
 def test_a_link_beyond_its_limits_is_an_error() -> None:
     """One element displaced by 1 mm where 0.2 are allowed."""
-    volume = block(3)
-    state = start(volume)
-    assert beyond_limits(volume, state) == 0.0
+    cube = block(3)
+    state = start(cube)
+    assert beyond_limits(cube, state) == 0.0
     state.u[0, 13] = 1.0
-    assert abs(beyond_limits(volume, state) - 0.8) < 1e-6
+    assert abs(beyond_limits(cube, state) - 0.8) < 1e-6
 
 
 def test_the_four_bodies_do_touch() -> None:
