@@ -47,40 +47,40 @@ def beyond(strain, most):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def stress(law, m, strain):  # type: ignore[no-untyped-def]
-    """Stress along a link of material ``m``, kPa."""
-    e = beyond(strain, law[m, 4])
-    b = law[m, 2]
+def stress(law, strain):  # type: ignore[no-untyped-def]
+    """Stress along a link, kPa, by the law of a material: its row of :func:`constants` as a tuple."""
+    e = beyond(strain, law[4])
+    b = law[2]
     if e <= 0.0 or b == 0.0:
-        return law[m, 0] * e
-    bend = min(e, law[m, 3])
-    return law[m, 0] * ((math.exp(b * bend) - 1.0) / b + math.exp(b * bend) * (e - bend))
+        return law[0] * e
+    bend = min(e, law[3])
+    return law[0] * ((math.exp(b * bend) - 1.0) / b + math.exp(b * bend) * (e - bend))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def slope(law, m, strain):  # type: ignore[no-untyped-def]
+def slope(law, strain):  # type: ignore[no-untyped-def]
     """Slope of stress against strain, kPa; that at rest while a plastic link does not answer."""
-    e = beyond(strain, law[m, 4])
-    if e <= 0.0 or law[m, 2] == 0.0:
-        return law[m, 0]
-    return law[m, 0] * math.exp(law[m, 2] * min(e, law[m, 3]))
+    e = beyond(strain, law[4])
+    if e <= 0.0 or law[2] == 0.0:
+        return law[0]
+    return law[0] * math.exp(law[2] * min(e, law[3]))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def link_answer(law, a, b, axial, strain):  # type: ignore[no-untyped-def]
-    """Stress and its slope, kPa, of a link of materials ``a`` and ``b``; two halves in series; -1 is rigid.
+def link_answer(law, other, alone, axial, strain):  # type: ignore[no-untyped-def]
+    """Stress and its slope, kPa, of a link of two halves in series, by the laws of their materials.
 
-    In series the stresses of two linear halves at the common strain combine to their harmonic mean; that is used for
-    curved laws, too, where it is an approximation.
+    ``alone`` says that the other half is rigid or of the same material. In series the stresses of two linear halves at
+    the common strain combine to their harmonic mean; that is used for curved laws, too, where it is an approximation.
     """
     if axial:
-        t, k = stress(law, a, strain), slope(law, a, strain)
-        if b >= 0 and b != a:
-            t, k = _in_series(t, stress(law, b, strain)), _in_series(k, slope(law, b, strain))
+        t, k = stress(law, strain), slope(law, strain)
+        if not alone:
+            t, k = _in_series(t, stress(other, strain)), _in_series(k, slope(other, strain))
     else:
-        t, k = law[a, 1] * beyond(strain, law[a, 4]), law[a, 1]
-        if b >= 0 and b != a:
-            t, k = _in_series(t, law[b, 1] * beyond(strain, law[b, 4])), _in_series(k, law[b, 1])
+        t, k = law[1] * beyond(strain, law[4]), law[1]
+        if not alone:
+            t, k = _in_series(t, other[1] * beyond(strain, other[4])), _in_series(k, other[1])
     return t, k
 
 
