@@ -273,3 +273,15 @@ def test_the_terminals_strip_marks_value_and_band() -> None:
     """90 degrees over 20 cells: 4.5 degrees each."""
     assert terminal.strip(row(45.0, 36.0, 54.0, "deg")) == "········━━●━━·······"
     assert terminal.strip(row(0.0, 36.0, 54.0, "deg")).startswith("◆·······━")
+
+
+def test_what_was_out_of_sight_is_said_once_for_hands_that_were_lost_alike() -> None:
+    """And not at all where the device saw everything."""
+    gone = [TrackingLost(**at(10, tool=t), reason="a") for t in ("left", "right")]
+    back = [TrackingBack(**at(30, tool=t), lost_s=0.2) for t in ("left", "right")]
+    assert wording.out_of_sight([Aborted(**at(9), reason="")]) == ""
+    assert wording.out_of_sight([*gone, *back]) == "left and right not seen by the device for 0.20 s: a"
+    again = TrackingLost(**at(40, tool="left"), reason="b")
+    assert wording.out_of_sight([*gone, *back, again]) == (
+        "left not seen by the device for 0.20 s, then lost again: a; b; right not seen by the device for 0.20 s: a"
+    )

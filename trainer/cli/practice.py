@@ -93,6 +93,7 @@ def perform(
     from trainer.drivers import open_driver
     from trainer.drivers.driver import LiveDriver
     from trainer.metrics.registry import check_targets, score
+    from trainer.reporting.wording import out_of_sight
     from trainer.scene import build
     from trainer.session import interruptible, old_objects_left_alone, run
     from trainer.sinks.igtlink import IgtlinkSink
@@ -143,6 +144,7 @@ def perform(
         "ticks": scene.tick,
         "events": dict(Counter(event.kind for event in stored.events)),
         "metrics": [asdict(metric) for metric in metrics],
+        "out_of_sight": out_of_sight(stored.events),
         "recording": None if recording_path is None else str(recording_path),
         "log": str(log_path),
         "methods": {

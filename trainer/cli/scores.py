@@ -36,6 +36,8 @@ def print_result(result: dict[str, Any], task: Task) -> None:
         f"{task.title}: {result['outcome']} after {wording.duration(result['duration_s'])}, {result['reason']}"
     )
     console.print(table)
+    if result["out_of_sight"]:
+        console.print(f"out of sight   {result['out_of_sight']}; what moved meanwhile is in the scores", style="red")
     console.print(f"work per tick  median {pace['p50_ms']:.2f} ms, 99 % within {pace['p99_ms']:.2f} ms")
     console.print(f"methods        {_methods(result['methods'])}")
     console.print(f"session        {result['session']} in {result['log']}")

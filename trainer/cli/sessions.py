@@ -55,6 +55,7 @@ def show(
 ) -> None:
     """Show what a session was, how it ended, what happened and how it was scored."""
     from trainer.log import reader
+    from trainer.reporting.wording import out_of_sight
 
     with opened(db) as log:
         summary = reader.summary(log, session)
@@ -73,6 +74,8 @@ def show(
     print(f"  versions   {_versions(record)}")
     print(f"  recording  {header.recording or 'none'}")
     print(f"  events     {', '.join(f'{n} {kind}' for kind, n in _counts(record).items()) or 'none'}")
+    if lost := out_of_sight(record.events):
+        print(f"  unseen     {lost}")
     if events:
         print_table(("tick", "time", "tool", "kind", "what"), [_event_row(e) for e in record.events])
     print_metrics(metrics)

@@ -137,6 +137,7 @@ class SessionReport:
     tissue: tuple[TissueRow, ...]  # empty where the task has no region of the anatomy
     events: tuple[EventLine, ...]
     overruns: int  # ticks that took longer than their slot
+    out_of_sight: str  # which hands the device did not see, how long and why; empty where it saw all
 
     @property
     def missed(self) -> tuple[MetricRow, ...]:
@@ -168,6 +169,7 @@ def session_report(record: SessionRecord, task: Task) -> SessionReport:
         tissue=tissue_rows(performance),
         events=event_lines(record.events),
         overruns=sum(isinstance(e, TickOverrun) for e in record.events),
+        out_of_sight=wording.out_of_sight(record.events),
     )
 
 

@@ -10,13 +10,16 @@ from trainer.reporting.session import MetricRow, SessionReport
 
 
 def session_summary(report: SessionReport) -> str:
-    """How many targets were met, and which were missed."""
+    """How many targets were met, which were missed, and what the device did not see."""
     first = f"{_met(report.targets)}."
     missed = [
         f"{r.title.lower()} {wording.quantity(r.value, r.unit)} ({wording.band(r.target_low, r.target_high, r.unit)})"
         for r in report.missed
     ]
-    return f"{first} Outside: {', '.join(missed)}." if missed else first
+    said = [first] + ([f"Outside: {', '.join(missed)}."] if missed else [])
+    if report.out_of_sight:
+        said.append(f"Out of sight: {report.out_of_sight}; what moved meanwhile is in the scores.")
+    return " ".join(said)
 
 
 def _met(targets: Sequence[MetricRow]) -> str:

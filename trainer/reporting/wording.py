@@ -129,6 +129,15 @@ def unseen(events: Sequence[TrackingLost | TrackingBack]) -> str:
     return words + _why([e.reason for e in events if isinstance(e, TrackingLost)])
 
 
+def out_of_sight(events: Sequence[Event]) -> str:
+    """Which hands the device did not see, for how long and why, of all events of a session; "" where it saw all."""
+    told: dict[str, list[str]] = {}
+    for tool in sorted({e.tool for e in events if isinstance(e, TrackingLost)}):
+        own = [e for e in events if isinstance(e, TrackingLost | TrackingBack) and e.tool == tool]
+        told.setdefault(unseen(own), []).append(tool)
+    return "; ".join(f"{' and '.join(tools)} {words}" for words, tools in told.items())
+
+
 def _why(reasons: Sequence[str]) -> str:
     """The reasons after a colon, the most frequent first; nothing where there are none."""
     known = [reason for reason, _ in Counter(filter(None, reasons)).most_common()]
