@@ -23,6 +23,7 @@ FORCE_MN = {"bounds": Bounds(0.0, 1e6, low_open=True)}
 DRAG_MN = {"bounds": Bounds(0.0, 1e6)}
 SUTURES = "sutures.toml"
 MOST_LINKS = 10_000  # assumed: a hundred times those of a stitch
+MOST_ELEMENTS = 10**7  # of a block of a knee: more has mixed up a unit
 
 
 @dataclass(frozen=True)
@@ -116,13 +117,36 @@ class TissueSpec:
 
 
 @dataclass(frozen=True)
+class KneeSpec:
+    """A block of a knee; its frame is that of :mod:`trainer.anatomy.block`."""
+
+    name: str  # a built-in knee; another one may be practised on (--anatomy)
+    about: str  # the structure in whose middle the scene's origin is
+    axis: Literal["up", "along"]  # y runs up the patient, or up along that structure
+    voxel_mm: float = field(metadata={"bounds": Bounds(0.2, 2.0)})
+    low_mm: Vector = field(metadata=POSITION_MM)
+    high_mm: Vector = field(metadata=POSITION_MM)
+
+    def __post_init__(self) -> None:
+        size = [b - a for a, b in zip(self.low_mm, self.high_mm, strict=True)]
+        if min(size) < 2.0 * self.voxel_mm:
+            raise ValueError("'high_mm' must be greater than 'low_mm' by at least two voxels along each axis")
+        if math.prod(size) > MOST_ELEMENTS * self.voxel_mm**3:
+            raise ValueError(f"a block has at most {MOST_ELEMENTS} elements: 'voxel_mm' is too small")
+
+
+@dataclass(frozen=True)
 class AnatomySpec:
     """A volume of labelled elements: named structures move, all others are rigid (Gibson 1998, section 3.1)."""
 
-    section: str  # name of a drawn section of one layer
     tissue: tuple[TissueSpec, ...]
+    section: str = ""  # name of a drawn section of one layer, or …
+    knee: KneeSpec | None = None
+    hardness_mN_per_mm: Sourced | None = field(default=None, metadata=FORCE_MN)  # of what is rigid under a probe's tip
 
     def __post_init__(self) -> None:
+        if bool(self.section) == (self.knee is not None):
+            raise ValueError("an anatomy is either a 'section' or a 'knee'")
         names = [t.structure for t in self.tissue]
         if len(set(names)) != len(names):
             raise ValueError("two entries of 'tissue' are of the same structure")

@@ -13,6 +13,7 @@ from types import ModuleType
 import numpy as np
 
 from trainer.anatomy import vessel as vessels
+from trainer.anatomy.imported import Anatomy
 from trainer.anatomy.structures import structures
 from trainer.curriculum import Task
 from trainer.events import Aborted, Event, StepDone, TaskDone, TaskStarted, TrackingBack, TrackingLost
@@ -40,14 +41,17 @@ from trainer.view import View
 
 #: A tick in which an instrument or the needle's tip moves further than this is taken in several movements, mm.
 STRIDE_MM = 0.1
+#: In a region of the anatomy so much of a voxel is a stride: nothing there is finer.
+STRIDE_VOXELS = 0.25
 #: … but in no more than this many: beyond 1.6 mm in a tick the motion is a leap of the tracker.
 MOST_MOVEMENTS = 16
 
 
-def build(task: Task, tolerance_mN: float = holding.TOLERANCE_MN) -> Scene:
+def build(task: Task, tolerance_mN: float = holding.TOLERANCE_MN, anatomy: Anatomy | None = None) -> Scene:
     """The scene at rest, with the instruments at home and the needle where the task has it held.
 
-    ``tolerance_mN`` is the unbalanced force at which the tissue counts as in equilibrium.
+    ``tolerance_mN`` is the unbalanced force at which the tissue counts as in equilibrium; ``anatomy`` the knee to
+    practise on, where that is not the task's own. Raises ConfigError for an anatomy that the task cannot use.
     """
     spec = task.scene
     world_from_scene = Rigid(np.array(spec.position_mm), quaternion_from_euler_deg(spec.rotation_deg))
@@ -86,7 +90,7 @@ def build(task: Task, tolerance_mN: float = holding.TOLERANCE_MN) -> Scene:
         if spec.thread.drapes:
             drape.begin(world)
     if spec.anatomy is not None:
-        world.region = region.build(spec.anatomy, len(spec.instrument))
+        world.region = region.build(spec.anatomy, len(spec.instrument), anatomy)
     return Scene(world, tolerance_mN)
 
 
@@ -187,7 +191,9 @@ class Scene:
             held = self.world.jaws[i].tool_from_needle
             if held is not None:
                 farthest = max(farthest, math.dist((a @ held).position, (b @ held).position))
-        return min(MOST_MOVEMENTS, max(1, math.ceil(farthest / STRIDE_MM)))
+        region = self.world.region
+        stride = STRIDE_MM if region is None else STRIDE_VOXELS * min(region.volume.spacing_mm)
+        return min(MOST_MOVEMENTS, max(1, math.ceil(farthest / stride)))
 
     def _move(self, poses: list[Rigid], closures: Array, start_s: float, span_s: float) -> None:
         """One movement of all instruments, from ``start_s`` to ``start_s + span_s``."""

@@ -130,7 +130,10 @@ def _print_task(reference: str, task: Task) -> None:
     if scene.thread is not None:
         _print_component("thread", scene.thread)
     if scene.anatomy is not None:
-        print(f"  section {scene.anatomy.section}")
+        if scene.anatomy.knee is not None:
+            _print_component("knee", scene.anatomy.knee)
+        else:
+            print(f"  section {scene.anatomy.section}")
         for tissue in scene.anatomy.tissue:
             _print_component(tissue.structure, tissue)
     for instrument in scene.instrument:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -22,8 +23,11 @@ FIRM = 0.9  # closure that holds
 PULL_PACE = 0.15  # speed of a pull, as a share of the hand's
 PULL_BEYOND = 1.15  # a pull goes so much further than the step asks: tissue gives way in the jaws
 SNIP_MM = 4.0  # how far scissors go on after each snip
+ROW_MM = 2.0  # to either side, what one row of snips cuts
+OVERLAP_MM = 1.5  # a row goes so far beyond the nearest edge of what is left
+STRANDS_MM = (0.0, 3.0, -3.0, 6.0, -6.0)  # where strands are sought that cannot be seen
+MOST_ROWS = 12
 TRIES = 5  # at catching tissue
-MOST_SNIPS = 8
 WATCH_S = 2.0  # how long the hand looks whether cut ends draw apart
 
 
@@ -77,7 +81,7 @@ class ArthroscopicHands(Hands):
 
     def _pull(self, step: Step) -> Movement:
         here = self._pose[self._grasper]
-        way = np.array(step.place_mm) - here.position
+        way = self._view.place(np.array(step.place_mm)) - here.position
         size = float(np.linalg.norm(way))
         far = max(size, PULL_BEYOND * step.at_least_mm)
         target = Rigid(here.position + way / size * far + self._miss(), here.quaternion)
@@ -91,22 +95,40 @@ class ArthroscopicHands(Hands):
         yield from self._back(self._grasper)
 
     def _cut(self, step: Step) -> Movement:
-        """Snip across the structure at its mark, a little further each time, until it is severed."""
-        tool, done = self._scissors, self._view.steps_done
-        mark = self._view.tissue(step.structure, np.array(step.place_mm)) + self._miss()
-        ahead = self._home[tool].matrix[:, 0]
-        start = mark - SNIP_MM * ahead
-        yield from self._reach(tool, start)
-        for snip in range(MOST_SNIPS):
-            yield from self._jaws(tool, 1.0)
+        """Snip across the structure at its mark, a row beside the other, until it is severed."""
+        tool, done, place = self._scissors, self._view.steps_done, np.array(step.place_mm)
+        mark = self._view.tissue(step.structure, place) + self._miss()
+        ahead, aside = self._home[tool].matrix[:, 0], self._home[tool].matrix[:, 1]
+        before = math.inf
+        for strand in range(MOST_ROWS):
+            left = self._view.uncut(step.structure, place) - mark
+            if 0 < len(left) < before:  # what still holds and is nearest
+                nearest = min((left @ aside).tolist(), key=abs)
+                row = nearest + math.copysign(OVERLAP_MM, nearest)
+                depth = (left @ ahead)[np.abs(left @ aside - row) < ROW_MM]
+                nearest, farthest = float(depth.min()), float(depth.max())
+            else:  # a strand that cannot be seen
+                row = STRANDS_MM[strand % len(STRANDS_MM)]
+                nearest, farthest = -SNIP_MM, SNIP_MM
+            before = len(left) or math.inf
+            yield from self._snip_through(mark + row * aside, nearest, farthest)
             if self._view.steps_done > done:
-                break
+                return
+        raise Lost("the tissue is not cut through")
+
+    def _snip_through(self, place: Array, nearest: float, farthest: float) -> Movement:
+        """One row of snips, a little further each time, from ``nearest`` to ``farthest`` mm ahead of ``place``."""
+        tool, done = self._scissors, self._view.steps_done
+        ahead = self._home[tool].matrix[:, 0]
+        deep = nearest + SNIP_MM
+        yield from self._reach(tool, place + deep * ahead)
+        while True:
+            yield from self._jaws(tool, 1.0)
             yield from self._jaws(tool, 0.0)
-            onwards = start + (snip + 1) * SNIP_MM * ahead
-            yield from self._glide(tool, Rigid(onwards, self._pose[tool].quaternion), 0.5)
-        else:
-            raise Lost("the tissue is not cut through")
-        yield from self._jaws(tool, 0.0)
+            if self._view.steps_done > done or deep > farthest:
+                break
+            deep += SNIP_MM
+            yield from self._glide(tool, Rigid(place + deep * ahead, self._pose[tool].quaternion), 0.5)
         yield from self._back(tool)
 
     def _reach(self, tool: int, place: Array) -> Movement:

@@ -6,18 +6,34 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from trainer.anatomy import section
+from trainer.anatomy import block, library, section
+from trainer.anatomy.imported import Anatomy
 from trainer.anatomy.structures import number_of, structures
 from trainer.config import ConfigError
 from trainer.curriculum import AnatomySpec, TissueSpec
-from trainer.geometry import Array, Rigid
+from trainer.geometry import Array, Rigid, lengthwise
 from trainer.mechanics import volume as volumes
 from trainer.mechanics.incision import Change
 from trainer.mechanics.islands import islands
-from trainer.mechanics.volume import FREE, PRESENT, Indices, Material, Triple, Volume, VolumeError, VolumeState
+from trainer.mechanics.volume import (
+    FREE,
+    PRESENT,
+    STEPS,
+    Indices,
+    Material,
+    Triple,
+    Volume,
+    VolumeError,
+    VolumeState,
+    grid_strides,
+)
 
 #: Bits of an element that may be moved by whoever holds it.
 LOOSE = FREE | PRESENT
+#: A ligament grows into bone over this part of its length at each end; in between it lies against it. Assumed.
+INSERTION = 0.25
+#: How far above and below a level a cut is looked for: as far as a hand misses it. Assumed.
+LEVEL_MM = 4.0
 
 
 @dataclass
@@ -40,11 +56,16 @@ class Stroke:
 
 @dataclass
 class Region:
-    """A volume in the scene. Element (0, 0, 0) rests at ``origin``; the axes are the scene's."""
+    """A volume in the scene. Element (0, 0, 0) rests at ``origin``; the axes are the scene's.
+
+    The volume is no larger than what moves and what that is grown to; ``labels`` reach as far as the task does.
+    """
 
     volume: Volume
     state: VolumeState
     origin: Array  # (3,) mm
+    labels: np.ndarray  # (lx, ly, lz) uint8 of everything at rest, on the volume's grid
+    corner: Array  # (3,) mm, where the first of them is
     flat: int  # the axis along which there is one layer only, or -1: depth along it does not count
     tissue: dict[str, TissueSpec]  # by structure
     names: dict[int, str]  # of the labels
@@ -80,10 +101,10 @@ class Region:
 
     def structure_at(self, place: Array) -> str:
         """The structure that has its rest at ``place`` (3,) mm of the scene, or ""."""
-        index = np.floor((place - self.origin) / np.array(self.volume.spacing_mm) + 0.5).astype(int)
-        if (index < 0).any() or (index >= self.volume.shape).any():
+        index = np.floor((place - self.corner) / np.array(self.volume.spacing_mm) + 0.5).astype(int)
+        if (index < 0).any() or (index >= self.labels.shape).any():
             return ""
-        return self.names.get(int(self.volume.labels[tuple(index)]), "")
+        return self.names.get(int(self.labels[tuple(index)]), "")
 
     def mm3(self, elements: Indices) -> float:
         """What ``elements`` (k,) take up at rest."""
@@ -108,6 +129,25 @@ class Region:
             if not any(np.isin(ends, part).sum() > 1 for part in parts):
                 self.severed.add(structure)
 
+    def uncut_at(self, structure: str, place: Array) -> Indices:
+        """The elements (k,) of a structure at the level of ``place`` (3,) along it that nothing has been cut from.
+
+        Looked at is LEVEL_MM to each side, along the axis of the grid that the structure is nearest to. At its sides,
+        where the structure does not go on along that axis, there is nothing to cut.
+        """
+        elements = self.elements[structure]
+        rest = self.rest(elements)
+        way = lengthwise(rest)
+        axis = int(np.argmax(np.abs(way)))
+        h = self.volume.spacing_mm[axis]
+        both = np.uint8(0b11 << 2 * axis)
+        level = elements[np.abs((rest - place) @ way) < h]
+        for k in (-1, 0, 1):
+            level = level[(self.state.links[level + k * self.volume.strides[axis]] & both) == both]
+        opened = self.opened.get(structure, np.empty(0, np.int32))
+        steps = range(-round(LEVEL_MM / h), round(LEVEL_MM / h) + 1)
+        return level[~np.any([np.isin(level + k * self.volume.strides[axis], opened) for k in steps], axis=0)]
+
     def parted_mm(self, structure: str) -> float:
         """How far the cut ends of a severed structure have moved apart, mm; 0 as long as it holds together.
 
@@ -128,36 +168,86 @@ class Region:
         return float(found.mean()) if len(found) else 0.0
 
 
-def build(spec: AnatomySpec, instruments: int) -> Region:
-    """The region at rest. Raises ConfigError for an anatomy or structures that are not there."""
-    labels, spacing, origin = section.build(section.load(spec.section))
+def build(spec: AnatomySpec, instruments: int, anatomy: Anatomy | None = None) -> Region:
+    """The region at rest, of ``anatomy`` or of the knee that the task names.
+
+    Raises ConfigError for an anatomy or structures that are not there.
+    """
     for tissue in spec.tissue:
         for structure in (tissue.structure, *tissue.grown_to):
             if structure not in structures():
                 raise ConfigError(f"unknown structure '{structure}'; known: {', '.join(structures())}")
     free = {number_of(t.structure): _material(t) for t in spec.tissue}
     grown = {(number_of(t.structure), number_of(end)) for t in spec.tissue for end in t.grown_to}
+    labels, spacing, corner, name = _labels(spec, anatomy)
+    missing = [t.structure for t in spec.tissue if not (labels == number_of(t.structure)).any()]
+    if missing:
+        raise ConfigError(f"anatomy '{name}' has no {' and no '.join(missing)} where the task takes place")
+    near = np.argwhere(np.isin(labels, list(free)))
+    lowest, highest = np.maximum(near.min(axis=0) - 1, 0), near.max(axis=0) + 2
+    part = np.ascontiguousarray(labels[tuple(slice(a, b) for a, b in zip(lowest, highest, strict=True))])
     try:
-        volume = volumes.build(labels, spacing, free, grown)
+        volume = volumes.build(part, spacing, free, grown)
     except VolumeError as error:
-        raise ConfigError(f"anatomy '{spec.section}': {error}") from None
-    flat_labels = labels.reshape(-1)
+        raise ConfigError(f"anatomy '{name}': {error}") from None
+    state = volumes.start(volume)
     thin = [axis for axis, n in enumerate(labels.shape) if n == 1]
+    elements = {
+        t.structure: np.flatnonzero(part.reshape(-1) == number_of(t.structure)).astype(np.int32) for t in spec.tissue
+    }
+    if spec.knee is not None:
+        for structure, own in elements.items():
+            if structures()[structure].kind == "ligament":
+                _lay_against_bone(volume, state, own)
     return Region(
         volume=volume,
-        state=volumes.start(volume),
-        origin=origin,
+        state=state,
+        origin=corner + lowest * np.array(spacing),
+        labels=labels,
+        corner=corner,
         flat=thin[0] if thin else -1,
         tissue={t.structure: t for t in spec.tissue},
         names={s.number: name for name, s in structures().items()},
-        elements={
-            t.structure: np.flatnonzero(flat_labels == number_of(t.structure)).astype(np.int32) for t in spec.tissue
-        },
+        elements=elements,
         held=[None] * instruments,
         strokes=[None] * instruments,
         inside=[""] * instruments,
-        tacked=np.zeros(labels.size, dtype=bool),
+        tacked=np.zeros(part.size, dtype=bool),
     )
+
+
+def load_knee(spec: AnatomySpec | None, reference: str = "") -> Anatomy | None:
+    """The knee ``reference``, or the task's own without one; None where the task has no knee. Raises ConfigError."""
+    if spec is None or spec.knee is None:
+        if reference:
+            raise ConfigError("the task takes place in no knee that could be exchanged: leave out --anatomy")
+        return None
+    return library.load(reference or spec.knee.name, spec.knee.voxel_mm)
+
+
+def _labels(spec: AnatomySpec, anatomy: Anatomy | None) -> tuple[np.ndarray, Triple, Array, str]:
+    """All labels, their spacing, where the first is, and what to call them."""
+    if spec.knee is None:
+        labels, spacing, corner = section.build(section.load(spec.section))
+        return labels, spacing, corner, spec.section
+    knee = anatomy or library.load(spec.knee.name, spec.knee.voxel_mm)
+    labels, corner = block.cut_out(knee, spec.knee)
+    return labels, (spec.knee.voxel_mm,) * 3, corner, knee.name
+
+
+def _lay_against_bone(volume: Volume, state: VolumeState, elements: Indices) -> None:
+    """Break the links of a ligament to anything else but near its ends: there alone it is grown to it."""
+    rest = volume.rest(elements)
+    along = rest @ lengthwise(rest)
+    low, high = float(along.min()), float(along.max())
+    middle = elements[np.abs(along - 0.5 * (low + high)) < (0.5 - INSERTION) * (high - low)]
+    labels, strides = volume.labels.reshape(-1), grid_strides(volume)
+    for d in range(len(STEPS)):
+        linked = middle[(state.links[middle] & (1 << d)) != 0]
+        others = linked + strides[d]
+        apart = labels[others] != labels[linked]
+        state.links[linked[apart]] &= np.uint8(0xFF ^ (1 << d))
+        state.links[others[apart]] &= np.uint8(0xFF ^ (1 << (d ^ 1)))
 
 
 def _material(t: TissueSpec) -> Material:

@@ -82,12 +82,20 @@ class SceneView(View):
     def gap_mm(self) -> float:
         return goal.gap_mm(self._world)
 
+    def place(self, place_mm: Array) -> Array:
+        return self._world.world_from_scene.apply(place_mm)
+
     def tissue(self, structure: str, place_mm: Array) -> Array:
         world = self._world
         assert world.region is not None
         elements = world.region.elements[structure]
         away = np.linalg.norm(world.region.rest(elements) - place_mm, axis=1)
         return world.world_from_scene.apply(world.region.places(elements[[np.argmin(away)]])[0])
+
+    def uncut(self, structure: str, place_mm: Array) -> Array:
+        world = self._world
+        assert world.region is not None
+        return world.world_from_scene.apply(world.region.places(world.region.uncut_at(structure, place_mm)))
 
     @cached_property
     def tissue_holders(self) -> tuple[int, ...]:

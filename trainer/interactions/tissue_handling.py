@@ -35,6 +35,7 @@ def move(world: World, closures: Array, start_s: float, span_s: float) -> None:
     for i, hold in enumerate(region.held):
         if hold is not None:
             _lead(world, region, i, hold)
+    _keep_limits_at_tacks(region)
     _tear(world, region, end_s)
     relax(region.volume, region.state, span_s)
     _judge_pulls(world, region, end_s)
@@ -105,6 +106,15 @@ def _lead(world: World, region: Region, tool: int, hold: Hold) -> None:
         to[:, region.flat] = 0.0
     if (to.astype(np.float32) != region.state.u[:, hold.elements].T).any():
         drag(region.volume, region.state, hold.elements, to)
+
+
+def _keep_limits_at_tacks(region: Region) -> None:
+    """Relaxation asks for no limits; beside what is held the next drag restores them, beside a tack nobody would."""
+    held = [h.elements for h in region.held if h is not None]
+    tacked = np.flatnonzero(region.tacked).astype(np.int32)
+    tacked = np.setdiff1d(tacked, np.concatenate(held)) if held else tacked
+    if len(tacked) and region.state.awake is not None:
+        drag(region.volume, region.state, tacked, region.state.u[:, tacked].T)
 
 
 def _snip(world: World, region: Region, tool: int, closure: float, time_s: float) -> None:
