@@ -51,7 +51,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "drivers": DATA | {"calibration", "log", "image_header", "openigtlink", "profile", "view"},
     "simulators": DATA | {"drivers", "log", "profile"},
     "session": {"clock", "drivers", "events", "geometry", "poses", "scene", "sinks"},
-    "resimulation": DATA | {"log", "scene"},
+    "resimulation": DATA | {"anatomy", "log", "scene"},
     "metrics": DATA | {"log"},
     "reporting": DATA | {"log", "metrics"},
     "exports": DATA | {"log", "metrics"},

@@ -157,20 +157,24 @@ class InstrumentSpec:
     """One instrument and where it waits before the exercise."""
 
     tool: Literal["left", "right"]
-    kind: Literal["forceps", "grasper", "scissors"]
+    kind: Literal["forceps", "grasper", "scissors", "probe"]
     home_mm: Vector = field(metadata=POSITION_MM)
     home_rotation_deg: Vector = field(metadata=ANGLE_DEG)  # about x, then y, then z of the scene
-    reach_mm: float = field(metadata=LENGTH_MM)  # how far from the jaws' centre a thing can be to be caught
+    #: How far from the jaws' centre a thing can be to be caught; a probe's tip is a ball of this radius.
+    reach_mm: float = field(metadata=LENGTH_MM)
     grip_mN: Sourced = field(metadata=FORCE_MN)  # the most the fully closed jaws hold against a pull
     close_at: float = field(default=0.7, metadata={"bounds": Bounds(0.05, 1.0)})  # closure that grasps
     open_at: float = field(default=0.5, metadata={"bounds": Bounds(0.0, 0.95)})  # closure that lets go
     tack_at: float | None = field(default=None, metadata={"bounds": Bounds(0.05, 1.0)})  # closure that tacks tissue
+    portal_mm: Vector | None = field(default=None, metadata=POSITION_MM)  # where its shaft goes through the skin
 
     def __post_init__(self) -> None:
         if self.open_at >= self.close_at:
             raise ValueError("'open_at' must be less than 'close_at'")
         if self.tack_at is not None and (self.kind != "grasper" or self.tack_at <= self.close_at):
             raise ValueError("'tack_at' is for a grasper, and greater than 'close_at'")
+        if self.portal_mm is not None and math.hypot(*self.portal_mm) < 1.0:
+            raise ValueError("'portal_mm' must be at least 1 mm from the scene's origin, towards which it leads")
 
 
 @dataclass(frozen=True)
@@ -225,11 +229,11 @@ class Step:
     ``grasp``: an instrument holds ``structure``. ``pull``: what is held of it is at least ``at_least_mm`` from where it
     rests. ``tack``: it is tacked, at least ``at_least_mm`` from where it rests. ``cut``: no path leads through it any
     more between what it is grown to. ``retract``: the cut ends are at least ``at_least_mm`` apart. How far from
-    ``place_mm`` it was grasped or cut is for the metrics to say, too.
+    ``place_mm`` it was grasped or cut is for the metrics to say, too. ``probe``: a probe's tip touches ``structure``.
     """
 
     name: str
-    kind: Literal["drive", "withdraw", "tail", "approximate", "grasp", "pull", "tack", "cut", "retract"]
+    kind: Literal["drive", "withdraw", "tail", "approximate", "grasp", "pull", "tack", "cut", "retract", "probe"]
     vessel: str = ""
     direction: Literal["in", "out"] = "in"
     clock_deg: float = field(default=0.0, metadata=ANGLE_DEG)  # the marked place
@@ -289,6 +293,8 @@ class Task:
         for s in self.step:
             if s.kind in TISSUE_STEPS and s.structure not in movable:
                 raise ValueError(f"step '{s.name}' names no movable structure of the scene: {s.structure!r}")
+            if s.kind == "probe" and (not movable or all(i.kind != "probe" for i in self.scene.instrument)):
+                raise ValueError(f"step '{s.name}' needs an 'anatomy' and an instrument of kind 'probe'")
         if not self.step:
             raise ValueError("a task needs at least one 'step'")
 

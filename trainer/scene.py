@@ -18,7 +18,7 @@ from trainer.anatomy.structures import structures
 from trainer.curriculum import Task
 from trainer.events import Aborted, Event, StepDone, TaskDone, TaskStarted, TrackingBack, TrackingLost
 from trainer.geometry import Array, Rigid, quaternion_from_axes, quaternion_from_euler_deg, slerp
-from trainer.instruments import arthroscopic, forceps
+from trainer.instruments import arthroscopic, forceps, probe
 from trainer.instruments.needle import Needle, needle_point, needle_tangent
 from trainer.interactions import (
     drape,
@@ -90,7 +90,7 @@ def build(task: Task, tolerance_mN: float = holding.TOLERANCE_MN, anatomy: Anato
         if spec.thread.drapes:
             drape.begin(world)
     if spec.anatomy is not None:
-        world.region = region.build(spec.anatomy, len(spec.instrument), anatomy)
+        world.region = region.build(task, spec.anatomy, anatomy)
     return Scene(world, tolerance_mN)
 
 
@@ -256,6 +256,7 @@ class Scene:
             thread_end=world.place_in_world(world.nodes[-1]) if world.thread is not None else (0.0, 0.0, 0.0),
             thread_length_error=thread_pull.stretch(world), tail_mm=thread_pull.tail_mm(world),
             gap_mm=goal.gap_mm(world), pull_max_mN=world.region.pull_max_mN if world.region is not None else 0.0,
+            press_max_mN=world.region.press_max_mN if world.region is not None else 0.0,
         )  # fmt: skip
 
     def view(self) -> View:
@@ -315,7 +316,7 @@ class Scene:
 
 def _shape(kind: str) -> ModuleType:
     """The module that says what an instrument looks like."""
-    return forceps if kind == "forceps" else arthroscopic
+    return {"forceps": forceps, "probe": probe}.get(kind, arthroscopic)
 
 
 def _part_way(a: Rigid, b: Rigid, share: float) -> Rigid:

@@ -81,7 +81,15 @@ class View(ABC):
 
     @abstractmethod
     def uncut(self, structure: str, place_mm: Array) -> Array:
-        """Where the elements (k, 3) mm of a structure are that no cut near ``place_mm`` of the scene at rest has met."""
+        """Where the elements (k, 3) mm of a structure are that no cut near ``place_mm`` of the scene has met."""
+
+    @abstractmethod
+    def in_sight(self, structure: str, eye: Array) -> Array | None:
+        """The nearest place of a structure (3,) mm that a straight free way leads to from ``eye`` (3,); or None."""
+
+    @abstractmethod
+    def touched(self, tool: int) -> str:
+        """The structure that the tip of a probe touches, or ""."""
 
     @property
     @abstractmethod

@@ -10,9 +10,10 @@ from trainer.anatomy import block, library, section
 from trainer.anatomy.imported import Anatomy
 from trainer.anatomy.structures import number_of, structures
 from trainer.config import ConfigError
-from trainer.curriculum import AnatomySpec, TissueSpec
+from trainer.curriculum import AnatomySpec, Task, TissueSpec
 from trainer.geometry import Array, Rigid, lengthwise
 from trainer.mechanics import volume as volumes
+from trainer.mechanics.density_field import DensityField, density_field
 from trainer.mechanics.incision import Change
 from trainer.mechanics.islands import islands
 from trainer.mechanics.volume import (
@@ -32,8 +33,6 @@ from trainer.mechanics.volume import (
 LOOSE = FREE | PRESENT
 #: A ligament grows into bone over this part of its length at each end; in between it lies against it. Assumed.
 INSERTION = 0.25
-#: How far above and below a level a cut is looked for: as far as a hand misses it. Assumed.
-LEVEL_MM = 4.0
 
 
 @dataclass
@@ -55,6 +54,17 @@ class Stroke:
 
 
 @dataclass
+class Touch:
+    """What the tip of one probe presses on."""
+
+    elements: Indices = field(default_factory=lambda: np.empty(0, np.int32))  # (k,) that it pushes aside
+    soft: str = ""  # the structure of the last of them
+    outwards: Array = field(default_factory=lambda: np.zeros(3))  # (3,) out of what is rigid; zeros away from it
+    met: set[str] = field(default_factory=set)  # structures, since it began to touch
+    force_mN: float = 0.0  # on the tip, after the last movement
+
+
+@dataclass
 class Region:
     """A volume in the scene. Element (0, 0, 0) rests at ``origin``; the axes are the scene's.
 
@@ -72,12 +82,15 @@ class Region:
     elements: dict[str, Indices]  # of each movable structure
     held: list[Hold | None]  # by instrument
     strokes: list[Stroke | None]  # by instrument, while its blades close
-    inside: list[str]  # by instrument: the rigid structure that its tip is in, or ""
+    inside: list[str]  # by instrument: the structure that its tip is in or a probe's touches, or ""
+    touch: list[Touch]  # by instrument
+    hard: DensityField | None  # the field of what is rigid, for probes
     tacked: np.ndarray  # (n,) bool, fixed by a tack
     opened: dict[str, Indices] = field(default_factory=dict)  # elements of a structure that lost a link
     severed: set[str] = field(default_factory=set)  # structures that hold together no more
     torn_through: str = ""  # the first structure that was severed by a pull
     pull_max_mN: float = 0.0
+    press_max_mN: float = 0.0  # the greatest force on the tip of a probe
 
     def places(self, elements: Indices) -> Array:
         """Where ``elements`` (k,) are now: (k, 3) mm, scene."""
@@ -129,25 +142,6 @@ class Region:
             if not any(np.isin(ends, part).sum() > 1 for part in parts):
                 self.severed.add(structure)
 
-    def uncut_at(self, structure: str, place: Array) -> Indices:
-        """The elements (k,) of a structure at the level of ``place`` (3,) along it that nothing has been cut from.
-
-        Looked at is LEVEL_MM to each side, along the axis of the grid that the structure is nearest to. At its sides,
-        where the structure does not go on along that axis, there is nothing to cut.
-        """
-        elements = self.elements[structure]
-        rest = self.rest(elements)
-        way = lengthwise(rest)
-        axis = int(np.argmax(np.abs(way)))
-        h = self.volume.spacing_mm[axis]
-        both = np.uint8(0b11 << 2 * axis)
-        level = elements[np.abs((rest - place) @ way) < h]
-        for k in (-1, 0, 1):
-            level = level[(self.state.links[level + k * self.volume.strides[axis]] & both) == both]
-        opened = self.opened.get(structure, np.empty(0, np.int32))
-        steps = range(-round(LEVEL_MM / h), round(LEVEL_MM / h) + 1)
-        return level[~np.any([np.isin(level + k * self.volume.strides[axis], opened) for k in steps], axis=0)]
-
     def parted_mm(self, structure: str) -> float:
         """How far the cut ends of a severed structure have moved apart, mm; 0 as long as it holds together.
 
@@ -168,19 +162,19 @@ class Region:
         return float(found.mean()) if len(found) else 0.0
 
 
-def build(spec: AnatomySpec, instruments: int, anatomy: Anatomy | None = None) -> Region:
-    """The region at rest, of ``anatomy`` or of the knee that the task names.
+def build(task: Task, spec: AnatomySpec, anatomy: Anatomy | None = None) -> Region:
+    """The region of a task at rest, of ``anatomy`` or of the knee that its ``spec`` names.
 
     Raises ConfigError for an anatomy or structures that are not there.
     """
-    for tissue in spec.tissue:
-        for structure in (tissue.structure, *tissue.grown_to):
-            if structure not in structures():
-                raise ConfigError(f"unknown structure '{structure}'; known: {', '.join(structures())}")
+    needed = dict.fromkeys([t.structure for t in spec.tissue] + [s.structure for s in task.step])
+    for structure in (*needed, *(end for t in spec.tissue for end in t.grown_to)):
+        if structure not in structures():
+            raise ConfigError(f"unknown structure '{structure}'; known: {', '.join(structures())}")
     free = {number_of(t.structure): _material(t) for t in spec.tissue}
     grown = {(number_of(t.structure), number_of(end)) for t in spec.tissue for end in t.grown_to}
     labels, spacing, corner, name = _labels(spec, anatomy)
-    missing = [t.structure for t in spec.tissue if not (labels == number_of(t.structure)).any()]
+    missing = [structure for structure in needed if not (labels == number_of(structure)).any()]
     if missing:
         raise ConfigError(f"anatomy '{name}' has no {' and no '.join(missing)} where the task takes place")
     near = np.argwhere(np.isin(labels, list(free)))
@@ -199,6 +193,7 @@ def build(spec: AnatomySpec, instruments: int, anatomy: Anatomy | None = None) -
         for structure, own in elements.items():
             if structures()[structure].kind == "ligament":
                 _lay_against_bone(volume, state, own)
+    instruments = len(task.scene.instrument)
     return Region(
         volume=volume,
         state=state,
@@ -212,17 +207,20 @@ def build(spec: AnatomySpec, instruments: int, anatomy: Anatomy | None = None) -
         held=[None] * instruments,
         strokes=[None] * instruments,
         inside=[""] * instruments,
+        touch=[Touch() for _ in range(instruments)],
+        hard=_hard(spec, labels, spacing, corner),
         tacked=np.zeros(part.size, dtype=bool),
     )
 
 
-def load_knee(spec: AnatomySpec | None, reference: str = "") -> Anatomy | None:
-    """The knee ``reference``, or the task's own without one; None where the task has no knee. Raises ConfigError."""
-    if spec is None or spec.knee is None:
-        if reference:
-            raise ConfigError("the task takes place in no knee that could be exchanged: leave out --anatomy")
+def _hard(spec: AnatomySpec, labels: np.ndarray, spacing: Triple, corner: Array) -> DensityField | None:
+    """What presses on a probe's tip; None where the task tells no hardness."""
+    if spec.hardness_mN_per_mm is None:
         return None
-    return library.load(reference or spec.knee.name, spec.knee.voxel_mm)
+    rigid = (labels > 0) & ~np.isin(labels, [number_of(t.structure) for t in spec.tissue])
+    hardness = spec.hardness_mN_per_mm.value
+    # No device's limit: what a hand presses with is to be told, not what a motor can.
+    return density_field(rigid, spacing, Rigid(corner, np.array([1.0, 0.0, 0.0, 0.0])), hardness, 1e9)
 
 
 def _labels(spec: AnatomySpec, anatomy: Anatomy | None) -> tuple[np.ndarray, Triple, Array, str]:
