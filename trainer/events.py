@@ -304,7 +304,8 @@ KINDS: dict[str, type[Event]] = {
     cls.kind: cls
     for cls in (
         Grasp, Release, Slip, Drop, Contact, Pierce, Withdraw, PullThrough, Drape, Undrape, Break, Tear, Cut, Tack,
-        Probe, PortalEnter, PortalExit, Overforce, TrackingLost, TrackingBack, TickOverrun, TaskStarted, StepDone, Aborted, TaskDone,
+        Probe, PortalEnter, PortalExit, Overforce, TrackingLost, TrackingBack, TickOverrun, TaskStarted, StepDone,
+        Aborted, TaskDone,
     )
 }  # fmt: skip
 

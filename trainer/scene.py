@@ -9,15 +9,16 @@ from __future__ import annotations
 import itertools
 import math
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 
+from trainer import showing
 from trainer.anatomy import vessel as vessels
 from trainer.anatomy.imported import Anatomy
-from trainer.anatomy.structures import structures
 from trainer.curriculum import Task
 from trainer.events import Aborted, Event, StepDone, TaskDone, TaskStarted, TrackingBack, TrackingLost
-from trainer.geometry import Array, Rigid, quaternion_from_axes, quaternion_from_euler_deg, slerp
+from trainer.geometry import Array, Rigid, quaternion_from_axes, quaternion_from_euler_deg, slerp, unit
 from trainer.instruments import arthroscopic, forceps, probe
 from trainer.instruments.needle import Needle, needle_point, needle_tangent
 from trainer.interactions import (
@@ -36,7 +37,7 @@ from trainer.interactions.world import Jaw, World
 from trainer.mechanics.equilibrium import Equilibrium
 from trainer.mechanics.thread import ThreadModel
 from trainer.poses import ToolPoses
-from trainer.sinks.surface import Cloud, Frame, InstrumentPart, Layout, Surface
+from trainer.sinks.surface import Frame, InstrumentPart, Layout, Surface
 from trainer.view import View
 
 #: A tick in which an instrument or the needle's tip moves further than this is taken in several movements, mm.
@@ -271,7 +272,8 @@ class Scene:
         return Layout(
             surfaces=tuple(
                 Surface(f"vessel/{v.spec.name}", v.display_triangles, (226, 120, 110, 205)) for v in self._vessels()
-            ),
+            )
+            + (showing.surfaces(world.region, world.world_from_scene) if world.region is not None else ()),
             parts=tuple(
                 InstrumentPart(f"{tool}/{blade.name}", i, blade.vertices, blade.triangles)
                 for i, tool in enumerate(self.tools)
@@ -284,8 +286,8 @@ class Scene:
             ),
             needle_radius_mm=0.5 * scene.needle.wire_mm if scene.needle else 0.0,
             thread_radius_mm=0.5 * scene.thread.diameter_mm.value if scene.thread else 0.0,
-            clouds=_clouds(world),
-            **_eye(world),
+            clouds=showing.clouds(world.region, world.world_from_scene) if world.region is not None else (),
+            **_looks(world),
         )
 
     def frame(self) -> Frame:
@@ -307,7 +309,7 @@ class Scene:
             thread=tuple(out.apply(piece) for piece in thread_pull.drawn(world)),
             force_mN=world.tissue_force_mN,
             tension_mN=world.tension_mN,
-            clouds=_moving_clouds(world),
+            clouds=tuple(out.apply(p) for p in showing.moving(world.region)) if world.region is not None else (),
         )
 
     def _vessels(self) -> tuple[vessels.Vessel, ...]:
@@ -325,38 +327,18 @@ def _part_way(a: Rigid, b: Rigid, share: float) -> Rigid:
     return Rigid(a.position + share * (b.position - a.position), slerp(a.quaternion, b.quaternion, share))
 
 
-def _clouds(world: World) -> tuple[Cloud, ...]:
-    """The structures of a region as a recording shows them."""
-    region = world.region
-    if region is None:
-        return ()
-    labels = region.volume.labels.reshape(-1)
-    radius = 0.5 * min(region.volume.spacing_mm)
-    found = []
-    for name, structure in structures().items():
-        elements = np.flatnonzero(labels == structure.number).astype(np.int32)
-        if len(elements):
-            fixed = None if name in region.elements else world.world_from_scene.apply(region.rest(elements))
-            found.append(Cloud(f"tissue/{name.replace(' ', '_')}", radius, (*structure.colour, 255), fixed))
-    return tuple(found)
-
-
-def _moving_clouds(world: World) -> tuple[Array, ...]:
-    """Where the elements of the structures are that are not fixed, in the order of :func:`_clouds`."""
-    region = world.region
-    if region is None:
-        return ()
-    moving = [region.elements[name] for name in structures() if name in region.elements]
-    return tuple(world.world_from_scene.apply(region.places(elements)) for elements in moving)
-
-
-def _eye(world: World) -> dict[str, tuple[float, float, float]]:
-    """Where a recording looks from: at a region from the front of its scene's z, so far that all of it shows."""
+def _looks(world: World) -> dict[str, Any]:
+    """Where a recording looks from, and what draws its pictures: a section is seen from the front of its z, a block
+    from the side on which the instruments wait."""
     region = world.region
     if region is None:
         return {}
-    size = np.array(region.volume.shape) * region.volume.spacing_mm
-    middle = region.origin + 0.5 * size
+    home = np.mean([i.home_mm for i in world.task.scene.instrument], axis=0)
     # Not straight down: the recording's view has +z up.
-    eye = middle + 1.1 * float(size.max()) * np.array([0.0, -0.25, 1.0])
-    return {"eye_mm": world.place_in_world(eye), "look_at_mm": world.place_in_world(middle)}
+    towards = np.array([0.0, -0.25, 1.0]) if region.flat >= 0 else unit(home)
+    eye, middle = showing.eye(region, towards)
+    return {
+        "eye_mm": world.place_in_world(eye),
+        "look_at_mm": world.place_in_world(middle),
+        "pictures": showing.pictures(region, world.scene_from_world, towards),
+    }

@@ -26,6 +26,7 @@ SNIP_MM = 4.0  # how far scissors go on after each snip
 ROW_MM = 2.0  # to either side, what one row of snips cuts
 OVERLAP_MM = 1.5  # a row goes so far beyond the nearest edge of what is left
 STRANDS_MM = (0.0, 3.0, -3.0, 6.0, -6.0)  # where strands are sought that cannot be seen
+EDGE_MM = 1.0  # and so much further ahead
 MOST_ROWS = 12
 TRIES = 5  # at catching tissue
 INSIDE = 0.2  # detours in the joint, which is narrow, as a share of those outside
@@ -113,10 +114,10 @@ class ArthroscopicHands(Hands):
                 nearest = min((left @ aside).tolist(), key=abs)
                 row = nearest + math.copysign(OVERLAP_MM, nearest)
                 depth = (left @ ahead)[np.abs(left @ aside - row) < ROW_MM]
-                nearest, farthest = float(depth.min()), float(depth.max())
+                nearest, farthest = float(depth.min()), float(depth.max()) + EDGE_MM
             else:  # a strand that cannot be seen
                 row = STRANDS_MM[strand % len(STRANDS_MM)]
-                nearest, farthest = -SNIP_MM, SNIP_MM
+                nearest, farthest = -SNIP_MM, 2.0 * SNIP_MM
             before = len(left) or math.inf
             yield from self._snip_through(mark + row * aside, nearest, farthest)
             if self._view.steps_done > done:

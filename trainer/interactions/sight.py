@@ -29,7 +29,7 @@ def uncut_at(region: Region, structure: str, place: Array) -> Indices:
     h = region.volume.spacing_mm[axis]
     both = np.uint8(0b11 << 2 * axis)
     level = elements[np.abs((rest - place) @ way) < h]
-    for k in (-1, 0, 1):
+    for k in (0, -1, 1):  # who has both links has both neighbours
         level = level[(region.state.links[level + k * region.volume.strides[axis]] & both) == both]
     opened = region.opened.get(structure, np.empty(0, np.int32))
     steps = range(-round(LEVEL_MM / h), round(LEVEL_MM / h) + 1)

@@ -51,6 +51,8 @@ NORMAL_STEP = 2.0**-8
 #: A killed process loses the pictures of at most so much simulated time, s; in the beginning of half the session. Of
 #: each flush rerun keeps some 60 kB for the file's footer: one every second adds 4 MB a minute (measured).
 FLUSH_S = 5.0
+#: Time between two drawings of a scene's pictures, s of the session: they cost as much as many frames. Assumed.
+PICTURES_S = 5.0
 #: Frames that may wait for the thread: half a second at 30 Hz.
 FRAMES_WAITING = 15
 
@@ -105,6 +107,7 @@ class RecordingSink:
         self._ticks_per_frame = max(1, math.ceil(tick_hz / max_hz - 1e-9))
         self._tick_hz = tick_hz
         self._next_frame = 0
+        self._next_picture_s = 0.0
         self._next_flush = 0
         self._last = (0, 0.0)
         self._steps = [str(step["name"]) for step in tomllib.loads(header.task_toml).get("step", [])]
@@ -121,7 +124,7 @@ class RecordingSink:
             batcher_config=rr.ChunkBatcherConfig(flush_tick=datetime.timedelta(days=1)),
         )
         self._stream.set_log_time_enabled(False)
-        self._file = RrdFile(self.path, self._stream, blueprint(layout.eye_mm, layout.look_at_mm))
+        self._file = RrdFile(self.path, self._stream, blueprint(layout))
         self._log_header()
         self._log_layout()
 
@@ -194,6 +197,11 @@ class RecordingSink:
         if moment.frame is not None:
             self._set_time(*self._last)
             self._log_frame(moment.frame)
+            ended = any(isinstance(event, TaskDone) for event in moment.events)
+            if self._layout.pictures is not None and (ended or moment.time_s >= self._next_picture_s):
+                self._next_picture_s = moment.time_s + PICTURES_S
+                for name, picture in self._layout.pictures(moment.frame).items():
+                    self._stream.log(f"pictures/{name}", rr.Image(picture))
             for tool, closure in zip(self._header.tools, moment.closure, strict=True):
                 self._stream.log(f"closure/{tool}", rr.Scalars(closure))
 
@@ -227,8 +235,16 @@ class RecordingSink:
         layout = self._layout
         log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         for surface in layout.surfaces:
-            topology = rr.Mesh3D.from_fields(triangle_indices=surface.triangles, albedo_factor=surface.rgba)
-            log(f"world/{surface.name}", topology, static=True)
+            if surface.fixed is None:
+                mesh = rr.Mesh3D.from_fields(triangle_indices=surface.triangles, albedo_factor=surface.rgba)
+            else:
+                mesh = rr.Mesh3D(
+                    vertex_positions=surface.fixed,
+                    triangle_indices=surface.triangles,
+                    vertex_normals=_normals(surface.fixed, surface.triangles),
+                    albedo_factor=surface.rgba,
+                )
+            log(f"world/{surface.name}", mesh, static=True)
         for part in layout.parts:
             mesh = rr.Mesh3D(
                 vertex_positions=part.vertices,
@@ -255,7 +271,8 @@ class RecordingSink:
 
     def _log_frame(self, frame: Frame) -> None:
         log = self._stream.log
-        for surface, vertices in zip(self._layout.surfaces, frame.vertices, strict=True):
+        surfaces = [surface for surface in self._layout.surfaces if surface.fixed is None]
+        for surface, vertices in zip(surfaces, frame.vertices, strict=True):
             mesh = rr.Mesh3D.from_fields(
                 vertex_positions=_rounded(vertices, VERTEX_STEP_MM),
                 vertex_normals=_rounded(_normals(vertices, surface.triangles), NORMAL_STEP),
