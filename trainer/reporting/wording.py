@@ -173,8 +173,10 @@ def describe(event: Event) -> str:
             return f"{event.body}, {event.volume_mm3:.0f} mm³ at {event.force_mN:.0f} mN"
         case Probe():
             return f"{event.body}, {event.force_mN:.0f} mN" if event.force_mN else event.body
-        case PortalEnter() | PortalExit():
-            return ""
+        case PortalEnter():
+            return "in through the portal"
+        case PortalExit():
+            return "out of the portal"
         case Tear():
             return f"{event.wall} wall of {event.body} at {event.force_mN:.0f} mN"
         case Overforce():
