@@ -134,6 +134,9 @@ def _print_task(reference: str, task: Task) -> None:
             _print_component("knee", scene.anatomy.knee)
         else:
             print(f"  section {scene.anatomy.section}")
+        if scene.anatomy.hardness_mN_per_mm is not None:
+            hardness = scene.anatomy.hardness_mN_per_mm
+            print(f"  hardness_mN_per_mm = {hardness.value:g}  [{hardness.source}]")
         for tissue in scene.anatomy.tissue:
             _print_component(tissue.structure, tissue)
     for instrument in scene.instrument:

@@ -51,8 +51,6 @@ NORMAL_STEP = 2.0**-8
 #: A killed process loses the pictures of at most so much simulated time, s; in the beginning of half the session. Of
 #: each flush rerun keeps some 60 kB for the file's footer: one every second adds 4 MB a minute (measured).
 FLUSH_S = 5.0
-#: Time between two drawings of a scene's pictures, s of the session: they cost as much as many frames. Assumed.
-PICTURES_S = 5.0
 #: Frames that may wait for the thread: half a second at 30 Hz.
 FRAMES_WAITING = 15
 
@@ -107,7 +105,7 @@ class RecordingSink:
         self._ticks_per_frame = max(1, math.ceil(tick_hz / max_hz - 1e-9))
         self._tick_hz = tick_hz
         self._next_frame = 0
-        self._next_picture_s = 0.0
+        self._draw = layout.pictures is not None
         self._next_flush = 0
         self._last = (0, 0.0)
         self._steps = [str(step["name"]) for step in tomllib.loads(header.task_toml).get("step", [])]
@@ -193,13 +191,14 @@ class RecordingSink:
         for event in moment.events:
             self._set_time(event.tick, event.time_s)
             self._log_event(event)
+            # They cost as much as many frames: one drawing for each step of the task, one at the end.
+            self._draw |= isinstance(event, StepDone | TaskDone)
         self._last = (moment.tick, moment.time_s)
         if moment.frame is not None:
             self._set_time(*self._last)
             self._log_frame(moment.frame)
-            ended = any(isinstance(event, TaskDone) for event in moment.events)
-            if self._layout.pictures is not None and (ended or moment.time_s >= self._next_picture_s):
-                self._next_picture_s = moment.time_s + PICTURES_S
+            if self._draw and self._layout.pictures is not None:
+                self._draw = False
                 for name, picture in self._layout.pictures(moment.frame).items():
                     self._stream.log(f"pictures/{name}", rr.Image(picture))
             for tool, closure in zip(self._header.tools, moment.closure, strict=True):
