@@ -44,11 +44,11 @@ def _touched(event: Event) -> bool:
     return isinstance(event, Contact | Pierce | Overforce | Cut | Probe)
 
 
-@metric("overforce_count", "count", better="lower", version="2")
+@metric("overforce_count", "count", better="lower", version="3")
 def overforces(performance: Performance, _: str) -> float | None:
     """How often a force or pressure rose above the task's limits; once per excursion.
 
-    None where neither needle nor jaws touched a wall or tissue: no touch is not a gentle one.
+    None where neither needle, jaws nor tip touched anything: no touch is not a gentle one.
     """
     return _count(performance, Overforce) if any(map(_touched, performance.record.events)) else None
 
