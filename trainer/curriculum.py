@@ -23,6 +23,7 @@ FORCE_MN = {"bounds": Bounds(0.0, 1e6, low_open=True)}
 DRAG_MN = {"bounds": Bounds(0.0, 1e6)}
 SUTURES = "sutures.toml"
 MOST_LINKS = 10_000  # assumed: a hundred times those of a stitch
+MOST_ELEMENTS = 10**7  # of a block of a knee: more has mixed up a unit
 
 
 @dataclass(frozen=True)
@@ -116,13 +117,36 @@ class TissueSpec:
 
 
 @dataclass(frozen=True)
+class KneeSpec:
+    """A block of a knee; its frame is that of :mod:`trainer.anatomy.block`."""
+
+    name: str  # a built-in knee; another one may be practised on (--anatomy)
+    about: str  # the structure in whose middle the scene's origin is
+    axis: Literal["up", "along"]  # y runs up the patient, or up along that structure
+    voxel_mm: float = field(metadata={"bounds": Bounds(0.2, 2.0)})
+    low_mm: Vector = field(metadata=POSITION_MM)
+    high_mm: Vector = field(metadata=POSITION_MM)
+
+    def __post_init__(self) -> None:
+        size = [b - a for a, b in zip(self.low_mm, self.high_mm, strict=True)]
+        if min(size) < 2.0 * self.voxel_mm:
+            raise ValueError("'high_mm' must be greater than 'low_mm' by at least two voxels along each axis")
+        if math.prod(size) > MOST_ELEMENTS * self.voxel_mm**3:
+            raise ValueError(f"a block has at most {MOST_ELEMENTS} elements: 'voxel_mm' is too small")
+
+
+@dataclass(frozen=True)
 class AnatomySpec:
     """A volume of labelled elements: named structures move, all others are rigid (Gibson 1998, section 3.1)."""
 
-    section: str  # name of a drawn section of one layer
     tissue: tuple[TissueSpec, ...]
+    section: str = ""  # name of a drawn section of one layer, or …
+    knee: KneeSpec | None = None
+    hardness_mN_per_mm: Sourced | None = field(default=None, metadata=FORCE_MN)  # of what is rigid under a probe's tip
 
     def __post_init__(self) -> None:
+        if bool(self.section) == (self.knee is not None):
+            raise ValueError("an anatomy is either a 'section' or a 'knee'")
         names = [t.structure for t in self.tissue]
         if len(set(names)) != len(names):
             raise ValueError("two entries of 'tissue' are of the same structure")
@@ -133,20 +157,24 @@ class InstrumentSpec:
     """One instrument and where it waits before the exercise."""
 
     tool: Literal["left", "right"]
-    kind: Literal["forceps", "grasper", "scissors"]
+    kind: Literal["forceps", "grasper", "scissors", "probe"]
     home_mm: Vector = field(metadata=POSITION_MM)
     home_rotation_deg: Vector = field(metadata=ANGLE_DEG)  # about x, then y, then z of the scene
-    reach_mm: float = field(metadata=LENGTH_MM)  # how far from the jaws' centre a thing can be to be caught
+    #: How far from the jaws' centre a thing can be to be caught; a probe's tip is a ball of this radius.
+    reach_mm: float = field(metadata=LENGTH_MM)
     grip_mN: Sourced = field(metadata=FORCE_MN)  # the most the fully closed jaws hold against a pull
     close_at: float = field(default=0.7, metadata={"bounds": Bounds(0.05, 1.0)})  # closure that grasps
     open_at: float = field(default=0.5, metadata={"bounds": Bounds(0.0, 0.95)})  # closure that lets go
     tack_at: float | None = field(default=None, metadata={"bounds": Bounds(0.05, 1.0)})  # closure that tacks tissue
+    portal_mm: Vector | None = field(default=None, metadata=POSITION_MM)  # where its shaft goes through the skin
 
     def __post_init__(self) -> None:
         if self.open_at >= self.close_at:
             raise ValueError("'open_at' must be less than 'close_at'")
         if self.tack_at is not None and (self.kind != "grasper" or self.tack_at <= self.close_at):
             raise ValueError("'tack_at' is for a grasper, and greater than 'close_at'")
+        if self.portal_mm is not None and math.hypot(*self.portal_mm) < 1.0:
+            raise ValueError("'portal_mm' must be at least 1 mm from the scene's origin, towards which it leads")
 
 
 @dataclass(frozen=True)
@@ -201,11 +229,11 @@ class Step:
     ``grasp``: an instrument holds ``structure``. ``pull``: what is held of it is at least ``at_least_mm`` from where it
     rests. ``tack``: it is tacked, at least ``at_least_mm`` from where it rests. ``cut``: no path leads through it any
     more between what it is grown to. ``retract``: the cut ends are at least ``at_least_mm`` apart. How far from
-    ``place_mm`` it was grasped or cut is for the metrics to say, too.
+    ``place_mm`` it was grasped or cut is for the metrics to say, too. ``probe``: a probe's tip touches ``structure``.
     """
 
     name: str
-    kind: Literal["drive", "withdraw", "tail", "approximate", "grasp", "pull", "tack", "cut", "retract"]
+    kind: Literal["drive", "withdraw", "tail", "approximate", "grasp", "pull", "tack", "cut", "retract", "probe"]
     vessel: str = ""
     direction: Literal["in", "out"] = "in"
     clock_deg: float = field(default=0.0, metadata=ANGLE_DEG)  # the marked place
@@ -265,6 +293,8 @@ class Task:
         for s in self.step:
             if s.kind in TISSUE_STEPS and s.structure not in movable:
                 raise ValueError(f"step '{s.name}' names no movable structure of the scene: {s.structure!r}")
+            if s.kind == "probe" and (not movable or all(i.kind != "probe" for i in self.scene.instrument)):
+                raise ValueError(f"step '{s.name}' needs an 'anatomy' and an instrument of kind 'probe'")
         if not self.step:
             raise ValueError("a task needs at least one 'step'")
 

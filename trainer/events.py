@@ -196,10 +196,27 @@ class Tack(Event):
 
 @dataclass(frozen=True)
 class Probe(Event):
-    """The tip of an instrument touched something rigid."""
+    """The tip of an instrument went into something rigid, or that of a probe touched a structure."""
 
     kind = "probe"
     body: str  # structure
+    point: Vector
+    force_mN: float = 0.0  # on the tip of a probe
+
+
+@dataclass(frozen=True)
+class PortalEnter(Event):
+    """The tip of an instrument went in through its portal, about which its shaft turns from now on."""
+
+    kind = "portal_enter"
+    point: Vector
+
+
+@dataclass(frozen=True)
+class PortalExit(Event):
+    """The tip of an instrument came out of its portal."""
+
+    kind = "portal_exit"
     point: Vector
 
 
@@ -280,13 +297,15 @@ class TaskDone(Event):
     tail_mm: float  # thread left before the first hole; 0 without a thread in a hole
     gap_mm: float  # distance of the two ends' edges at the stitch, or of a structure's cut ends; 0 without either
     pull_max_mN: float = 0.0  # the greatest pull of an instrument on tissue of a volume
+    press_max_mN: float = 0.0  # the greatest force on the tip of a probe
 
 
 KINDS: dict[str, type[Event]] = {
     cls.kind: cls
     for cls in (
         Grasp, Release, Slip, Drop, Contact, Pierce, Withdraw, PullThrough, Drape, Undrape, Break, Tear, Cut, Tack,
-        Probe, Overforce, TrackingLost, TrackingBack, TickOverrun, TaskStarted, StepDone, Aborted, TaskDone,
+        Probe, PortalEnter, PortalExit, Overforce, TrackingLost, TrackingBack, TickOverrun, TaskStarted, StepDone,
+        Aborted, TaskDone,
     )
 }  # fmt: skip
 

@@ -40,6 +40,11 @@ def cross(a: Array, b: Array) -> Array:
     return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
+def lengthwise(points: Array) -> Array:
+    """The direction (3,), of length 1, along which points (n, 3) are spread the most; either way."""
+    return np.asarray(np.linalg.eigh(np.cov((points - points.mean(axis=0)).T))[1][:, 2])
+
+
 def quaternion_multiply(a: ArrayLike, b: ArrayLike) -> Array:
     """Hamilton product of quaternions ``(..., 4)``: the rotation b followed by a."""
     aw, ax, ay, az = np.moveaxis(np.asarray(a, dtype=np.float64), -1, 0)

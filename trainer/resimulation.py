@@ -10,8 +10,12 @@ from collections.abc import Iterable
 from itertools import zip_longest
 
 from trainer import curriculum, scene
+from trainer.anatomy import library
+from trainer.anatomy.imported import Anatomy
+from trainer.config import ConfigError
+from trainer.curriculum import Task
 from trainer.events import Event, TaskDone, payload
-from trainer.log.record import TOLERANCE, SessionRecord
+from trainer.log.record import ANATOMY, ANATOMY_SHA256, TOLERANCE, SessionHeader, SessionRecord
 
 
 def resimulate(record: SessionRecord, rows: Iterable[int] | None = None) -> list[Event]:
@@ -19,11 +23,12 @@ def resimulate(record: SessionRecord, rows: Iterable[int] | None = None) -> list
 
     The tissue is solved to the stored tolerance; sessions older than the choice of one have that of ``build``.
     ``rows`` are the indices of the stored ticks; a progress bar may wrap them. Raises ConfigError when the
-    stored task no longer fits this version of the program.
+    stored task no longer fits this version of the program, or its knee is not there or is another one now.
     """
     header = record.header
     chosen = {"tolerance_mN": float(header.versions[TOLERANCE])} if TOLERANCE in header.versions else {}
-    running = scene.build(curriculum.parse_task(header.task_toml, header.task), **chosen)
+    task = curriculum.parse_task(header.task_toml, header.task)
+    running = scene.build(task, **chosen, anatomy=_knee(header, task))
     found: list[Event] = []
     for i in range(record.ticks) if rows is None else rows:
         found += running.step(record.poses(i))
@@ -32,6 +37,15 @@ def resimulate(record: SessionRecord, rows: Iterable[int] | None = None) -> list
     done = next((e for e in record.events if isinstance(e, TaskDone)), None)
     if done is not None:
         found += running.finish(done.outcome, done.reason)
+    return found
+
+
+def _knee(header: SessionHeader, task: Task) -> Anatomy | None:
+    """The knee that the session was practised in; None where its task has none. Raises ConfigError."""
+    reference = header.versions.get(ANATOMY, "")
+    found = library.of_task(task.scene.anatomy, reference)
+    if found is not None and header.versions.get(ANATOMY_SHA256) != library.fingerprint(found):
+        raise ConfigError(f"the knee '{reference}' has changed since session {header.id} was practised in it")
     return found
 
 

@@ -9,15 +9,17 @@ from __future__ import annotations
 import itertools
 import math
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 
+from trainer import showing
 from trainer.anatomy import vessel as vessels
-from trainer.anatomy.structures import structures
+from trainer.anatomy.imported import Anatomy
 from trainer.curriculum import Task
 from trainer.events import Aborted, Event, StepDone, TaskDone, TaskStarted, TrackingBack, TrackingLost
-from trainer.geometry import Array, Rigid, quaternion_from_axes, quaternion_from_euler_deg, slerp
-from trainer.instruments import arthroscopic, forceps
+from trainer.geometry import Array, Rigid, quaternion_from_axes, quaternion_from_euler_deg, slerp, unit
+from trainer.instruments import arthroscopic, forceps, probe
 from trainer.instruments.needle import Needle, needle_point, needle_tangent
 from trainer.interactions import (
     drape,
@@ -35,19 +37,22 @@ from trainer.interactions.world import Jaw, World
 from trainer.mechanics.equilibrium import Equilibrium
 from trainer.mechanics.thread import ThreadModel
 from trainer.poses import ToolPoses
-from trainer.sinks.surface import Cloud, Frame, InstrumentPart, Layout, Surface
+from trainer.sinks.surface import Frame, InstrumentPart, Layout, Surface
 from trainer.view import View
 
 #: A tick in which an instrument or the needle's tip moves further than this is taken in several movements, mm.
 STRIDE_MM = 0.1
+#: In a region of the anatomy so much of a voxel is a stride: nothing there is finer.
+STRIDE_VOXELS = 0.25
 #: … but in no more than this many: beyond 1.6 mm in a tick the motion is a leap of the tracker.
 MOST_MOVEMENTS = 16
 
 
-def build(task: Task, tolerance_mN: float = holding.TOLERANCE_MN) -> Scene:
+def build(task: Task, tolerance_mN: float = holding.TOLERANCE_MN, anatomy: Anatomy | None = None) -> Scene:
     """The scene at rest, with the instruments at home and the needle where the task has it held.
 
-    ``tolerance_mN`` is the unbalanced force at which the tissue counts as in equilibrium.
+    ``tolerance_mN`` is the unbalanced force at which the tissue counts as in equilibrium; ``anatomy`` the knee to
+    practise on, where that is not the task's own. Raises ConfigError for an anatomy that the task cannot use.
     """
     spec = task.scene
     world_from_scene = Rigid(np.array(spec.position_mm), quaternion_from_euler_deg(spec.rotation_deg))
@@ -86,7 +91,7 @@ def build(task: Task, tolerance_mN: float = holding.TOLERANCE_MN) -> Scene:
         if spec.thread.drapes:
             drape.begin(world)
     if spec.anatomy is not None:
-        world.region = region.build(spec.anatomy, len(spec.instrument))
+        world.region = region.build(task, spec.anatomy, anatomy)
     return Scene(world, tolerance_mN)
 
 
@@ -187,7 +192,9 @@ class Scene:
             held = self.world.jaws[i].tool_from_needle
             if held is not None:
                 farthest = max(farthest, math.dist((a @ held).position, (b @ held).position))
-        return min(MOST_MOVEMENTS, max(1, math.ceil(farthest / STRIDE_MM)))
+        region = self.world.region
+        stride = STRIDE_MM if region is None else STRIDE_VOXELS * min(region.volume.spacing_mm)
+        return min(MOST_MOVEMENTS, max(1, math.ceil(farthest / stride)))
 
     def _move(self, poses: list[Rigid], closures: Array, start_s: float, span_s: float) -> None:
         """One movement of all instruments, from ``start_s`` to ``start_s + span_s``."""
@@ -250,6 +257,7 @@ class Scene:
             thread_end=world.place_in_world(world.nodes[-1]) if world.thread is not None else (0.0, 0.0, 0.0),
             thread_length_error=thread_pull.stretch(world), tail_mm=thread_pull.tail_mm(world),
             gap_mm=goal.gap_mm(world), pull_max_mN=world.region.pull_max_mN if world.region is not None else 0.0,
+            press_max_mN=world.region.press_max_mN if world.region is not None else 0.0,
         )  # fmt: skip
 
     def view(self) -> View:
@@ -264,7 +272,8 @@ class Scene:
         return Layout(
             surfaces=tuple(
                 Surface(f"vessel/{v.spec.name}", v.display_triangles, (226, 120, 110, 205)) for v in self._vessels()
-            ),
+            )
+            + (showing.surfaces(world.region, world.world_from_scene) if world.region is not None else ()),
             parts=tuple(
                 InstrumentPart(f"{tool}/{blade.name}", i, blade.vertices, blade.triangles)
                 for i, tool in enumerate(self.tools)
@@ -277,8 +286,8 @@ class Scene:
             ),
             needle_radius_mm=0.5 * scene.needle.wire_mm if scene.needle else 0.0,
             thread_radius_mm=0.5 * scene.thread.diameter_mm.value if scene.thread else 0.0,
-            clouds=_clouds(world),
-            **_eye(world),
+            clouds=showing.clouds(world.region, world.world_from_scene) if world.region is not None else (),
+            **_looks(world),
         )
 
     def frame(self) -> Frame:
@@ -300,7 +309,7 @@ class Scene:
             thread=tuple(out.apply(piece) for piece in thread_pull.drawn(world)),
             force_mN=world.tissue_force_mN,
             tension_mN=world.tension_mN,
-            clouds=_moving_clouds(world),
+            clouds=tuple(out.apply(p) for p in showing.moving(world.region)) if world.region is not None else (),
         )
 
     def _vessels(self) -> tuple[vessels.Vessel, ...]:
@@ -309,7 +318,7 @@ class Scene:
 
 def _shape(kind: str) -> ModuleType:
     """The module that says what an instrument looks like."""
-    return forceps if kind == "forceps" else arthroscopic
+    return {"forceps": forceps, "probe": probe}.get(kind, arthroscopic)
 
 
 def _part_way(a: Rigid, b: Rigid, share: float) -> Rigid:
@@ -318,38 +327,18 @@ def _part_way(a: Rigid, b: Rigid, share: float) -> Rigid:
     return Rigid(a.position + share * (b.position - a.position), slerp(a.quaternion, b.quaternion, share))
 
 
-def _clouds(world: World) -> tuple[Cloud, ...]:
-    """The structures of a region as a recording shows them."""
-    region = world.region
-    if region is None:
-        return ()
-    labels = region.volume.labels.reshape(-1)
-    radius = 0.5 * min(region.volume.spacing_mm)
-    found = []
-    for name, structure in structures().items():
-        elements = np.flatnonzero(labels == structure.number).astype(np.int32)
-        if len(elements):
-            fixed = None if name in region.elements else world.world_from_scene.apply(region.rest(elements))
-            found.append(Cloud(f"tissue/{name.replace(' ', '_')}", radius, (*structure.colour, 255), fixed))
-    return tuple(found)
-
-
-def _moving_clouds(world: World) -> tuple[Array, ...]:
-    """Where the elements of the structures are that are not fixed, in the order of :func:`_clouds`."""
-    region = world.region
-    if region is None:
-        return ()
-    moving = [region.elements[name] for name in structures() if name in region.elements]
-    return tuple(world.world_from_scene.apply(region.places(elements)) for elements in moving)
-
-
-def _eye(world: World) -> dict[str, tuple[float, float, float]]:
-    """Where a recording looks from: at a region from the front of its scene's z, so far that all of it shows."""
+def _looks(world: World) -> dict[str, Any]:
+    """Where a recording looks from, and what draws its pictures: a section is seen from the front of its z, a block
+    from the side on which the instruments wait."""
     region = world.region
     if region is None:
         return {}
-    size = np.array(region.volume.shape) * region.volume.spacing_mm
-    middle = region.origin + 0.5 * size
+    home = np.mean([i.home_mm for i in world.task.scene.instrument], axis=0)
     # Not straight down: the recording's view has +z up.
-    eye = middle + 1.1 * float(size.max()) * np.array([0.0, -0.25, 1.0])
-    return {"eye_mm": world.place_in_world(eye), "look_at_mm": world.place_in_world(middle)}
+    towards = np.array([0.0, -0.25, 1.0]) if region.flat >= 0 else unit(home)
+    eye, middle = showing.eye(region, towards)
+    return {
+        "eye_mm": world.place_in_world(eye),
+        "look_at_mm": world.place_in_world(middle),
+        "pictures": showing.pictures(region, world.scene_from_world, towards),
+    }

@@ -72,8 +72,24 @@ class View(ABC):
         """Between the edges at the stitch."""
 
     @abstractmethod
+    def place(self, place_mm: Array) -> Array:
+        """Where a place (3,) mm of the scene is in the world."""
+
+    @abstractmethod
     def tissue(self, structure: str, place_mm: Array) -> Array:
         """Where the element of a structure is (3,) mm that is nearest to ``place_mm`` of the scene at rest."""
+
+    @abstractmethod
+    def uncut(self, structure: str, place_mm: Array) -> Array:
+        """Where the elements (k, 3) mm of a structure are that no cut near ``place_mm`` of the scene has met."""
+
+    @abstractmethod
+    def in_sight(self, structure: str, eye: Array) -> Array | None:
+        """The nearest place of a structure (3,) mm that a straight free way leads to from ``eye`` (3,); or None."""
+
+    @abstractmethod
+    def touched(self, tool: int) -> str:
+        """The structure that the tip of a probe touches, or ""."""
 
     @property
     @abstractmethod

@@ -15,6 +15,8 @@ from trainer.events import (
     Event,
     Grasp,
     Pierce,
+    PortalEnter,
+    PortalExit,
     Probe,
     PullThrough,
     StepDone,
@@ -31,6 +33,7 @@ from trainer.log.record import SessionHeader, SessionRecord
 STITCH = "anastomosis/single-stitch"
 DRIVE = "anastomosis/needle-drive"
 LIGAMENT = "arthroscopy/ligament-2d"
+LANDMARKS = "arthroscopy/probe-landmarks"
 PCL = "posterior cruciate ligament"
 TICK_HZ = 100.0
 TOOLS = ("left", "right")
@@ -164,6 +167,27 @@ def ligament() -> SessionRecord:
                      thread_end=zero, thread_length_error=0.0, tail_mm=0.0, gap_mm=1.6, pull_max_mN=9e3),
         ),
         reference=LIGAMENT,
+    )  # fmt: skip
+
+
+def landmarks() -> SessionRecord:
+    """``probe-landmarks`` given up after three of four: in twice through the portal, the femur touched once, 640 mN."""
+    zero = (0.0, 0.0, 0.0)
+    right = {"tool": "right"}
+    steps = task_of(LANDMARKS).step[:3]
+    return record(
+        (
+            TaskStarted(**at(0, tool=""), task=LANDMARKS),
+            PortalEnter(**at(50, **right), point=zero),
+            Probe(**at(60, **right), body="femur", point=zero, force_mN=60.0),
+            PortalExit(**at(70, **right), point=zero),
+            PortalEnter(**at(80, **right), point=zero),
+            *(Probe(**at(100 + i, **right), body=s.structure, point=zero, force_mN=55.0) for i, s in enumerate(steps)),
+            *(StepDone(**at(100 + i, 1, ""), step=s.name, index=i) for i, s in enumerate(steps)),
+            TaskDone(**at(260, 1, ""), outcome="aborted", reason="", needle_tip=zero, needle_tangent=(1.0, 0.0, 0.0),
+                     thread_end=zero, thread_length_error=0.0, tail_mm=0.0, gap_mm=0.0, press_max_mN=640.0),
+        ),
+        reference=LANDMARKS,
     )  # fmt: skip
 
 

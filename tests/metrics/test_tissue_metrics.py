@@ -4,7 +4,16 @@ from __future__ import annotations
 
 import pytest
 
-from tests.metrics.synthetic_session import LIGAMENT, STITCH, ligament, performed, record, task_of
+from tests.metrics.synthetic_session import (
+    LANDMARKS,
+    LIGAMENT,
+    STITCH,
+    landmarks,
+    ligament,
+    performed,
+    record,
+    task_of,
+)
 from trainer.metrics import score
 from trainer.reporting.session import session_report
 
@@ -18,6 +27,18 @@ def test_the_scores_of_a_known_session() -> None:
         "pull_max_mN": 9e3, "retraction_mm": 1.6,
     }  # fmt: skip
     assert {name: found[name] for name in expected} == pytest.approx(expected, rel=1e-12)
+
+
+def test_the_scores_of_known_touches() -> None:
+    """As :func:`landmarks` states them."""
+    found = {m.name: m.value for m in score(landmarks(), task_of(LANDMARKS))}
+    expected = {
+        "probe_force_max_mN": 640.0, "landmarks_touched_count": 3.0, "portal_entry_count": 2.0,
+        "iatrogenic_contact_count": 1.0, "structures_touched_count": 4.0, "overforce_count": 0.0,
+    }  # fmt: skip
+    assert {name: found[name] for name in expected} == expected
+    nothing = {m.name: m.value for m in score(record(reference=LANDMARKS), task_of(LANDMARKS))}
+    assert nothing["probe_force_max_mN"] is nothing["overforce_count"] is None
 
 
 def test_whoever_did_nothing_pulled_and_cut_nothing() -> None:

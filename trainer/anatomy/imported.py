@@ -35,6 +35,7 @@ class Anatomy:
     name: str
     volume: LabelVolume
     side: str  # left, right, or "" where nothing tells
+    reference: str  # what finds it again: a built-in knee's name, or the whole path of a folder
 
 
 def import_volume(path: Path, labels: Path, out: Path, spacing_mm: float | None = None) -> dict[str, Any]:
@@ -90,7 +91,7 @@ def load(folder: Path) -> Anatomy:
     """The knee in a folder that ``import_volume`` made. Raises ConfigError."""
     record = read_record(folder)
     volume = sorted_axes(volume_file.read(folder / LABELS), np.arange(volume_file.LARGEST_LABEL + 1).astype(np.uint8))
-    return Anatomy(folder.name, volume, str(record.get("side", "")))
+    return Anatomy(folder.name, volume, str(record.get("side", "")), str(folder.resolve()))
 
 
 def read_record(folder: Path) -> dict[str, Any]:

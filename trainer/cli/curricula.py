@@ -130,7 +130,13 @@ def _print_task(reference: str, task: Task) -> None:
     if scene.thread is not None:
         _print_component("thread", scene.thread)
     if scene.anatomy is not None:
-        print(f"  section {scene.anatomy.section}")
+        if scene.anatomy.knee is not None:
+            _print_component("knee", scene.anatomy.knee)
+        else:
+            print(f"  section {scene.anatomy.section}")
+        if scene.anatomy.hardness_mN_per_mm is not None:
+            hardness = scene.anatomy.hardness_mN_per_mm
+            print(f"  hardness_mN_per_mm = {hardness.value:g}  [{hardness.source}]")
         for tissue in scene.anatomy.tissue:
             _print_component(tissue.structure, tissue)
     for instrument in scene.instrument:

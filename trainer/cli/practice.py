@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from trainer.choice import Choice
     from trainer.clock import Fast
     from trainer.curriculum import TaskFile
     from trainer.drivers.driver import Driver
@@ -29,6 +28,9 @@ def practice(
         str, typer.Option(metavar="PROFILE|PATH", help="A device's name or .toml file, or a recording.")
     ] = "scripted-expert",
     seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Seed of a scripted hand's chance.")] = 0,
+    anatomy: Annotated[
+        str, typer.Option(metavar="PATH", help="Another knee than the task's: a folder of `anatomy import`, or a name.")
+    ] = "",
     realtime: Annotated[bool, typer.Option("--realtime/--fast", help="At the task's pace, or without pauses.")] = True,
     record: Annotated[
         Path | None, typer.Option(metavar="PATH.rrd", help="The recording; by default in recordings/ beside the log.")
@@ -57,7 +59,7 @@ def practice(
     task_file = load_task(task)
     clock = (Realtime if realtime else Fast)(task_file.task.tick_hz)
     with ExitStack() as stack:
-        result = perform(stack, task_file, session_id, name, device, seed, clock, log_path, recording)
+        result = perform(stack, task_file, session_id, name, device, seed, clock, log_path, recording, anatomy=anatomy)
         if as_json:
             print(json.dumps(result, indent=2, allow_nan=False))
         else:
@@ -79,19 +81,23 @@ def perform(
     recording_path: Path | None,
     enough: Callable[[], bool] = lambda: False,
     observed: Callable[[Driver, Sequence[Sink]], Sink] | None = None,
+    anatomy: str = "",
 ) -> dict[str, Any]:
     """Run one exercise and store it; the document that ``--json`` prints. ``stack`` closes what was opened.
 
     ``clock`` is a fresh one at the task's rate. ``enough``, asked once in each tick, ends the session like Ctrl-C.
-    ``observed`` is given the device and the sinks and makes one more sink, which may look at them.
+    ``observed`` is given the device and the sinks and makes one more sink, which may look at them. ``anatomy`` is the
+    knee to practise in, where that is not the task's own.
     Whatever can be refused is refused before the session enters the log. Raises ConfigError for a task or
     device that cannot be used, LogError and RecordingError where they cannot be written.
     """
+    from trainer.anatomy import library
     from trainer.choice import choose_tissue, region_method, thread_method
     from trainer.cli.progress import Progress
     from trainer.cli.warmup import announce, warm_up
     from trainer.drivers import open_driver
     from trainer.drivers.driver import LiveDriver
+    from trainer.log.record import ANATOMY, ANATOMY_SHA256, TOLERANCE
     from trainer.metrics.registry import check_targets, score
     from trainer.reporting.wording import out_of_sight
     from trainer.scene import build
@@ -103,16 +109,21 @@ def perform(
     task = task_file.task
     check_targets(task)
     tissue = choose_tissue(task, task_file.path)
+    knee = library.of_task(task.scene.anatomy, anatomy)
     if recording_path is not None:
         _make_room(recording_path)
     _close_interrupted(log_path)
     announce()
-    scene = build(task) if tissue is None else build(task, tissue.tolerance_mN)
+    scene = build(task, anatomy=knee) if tissue is None else build(task, tissue.tolerance_mN)
     profile, driver = open_driver(device, task, scene.home, seed)
     stack.enter_context(closing(driver))
     if clock.realtime:
-        warm_up(task)
-    header = _header(session_id, trainee, task_file, profile, seed, scene.tools, recording_path, tissue)
+        warm_up(task, knee)
+    header = _header(session_id, trainee, task_file, profile, seed, scene.tools, recording_path)
+    if tissue is not None:  # a float's text holds all its bits
+        header.versions[TOLERANCE] = repr(tissue.tolerance_mN)
+    if knee is not None:
+        header.versions.update({ANATOMY: knee.reference, ANATOMY_SHA256: library.fingerprint(knee)})
     sinks: list[Sink] = []
     recording = None
     if recording_path is not None:
@@ -137,6 +148,7 @@ def perform(
     return {
         "session": session_id,
         "task": task_file.path,
+        "anatomy": None if knee is None else knee.reference,
         "trainee": trainee,
         "outcome": scene.outcome,
         "reason": scene.reason,
@@ -165,11 +177,10 @@ def _header(
     seed: int,
     tools: tuple[str, ...],
     recording: Path | None,
-    tissue: Choice | None,
 ) -> SessionHeader:
     from datetime import UTC, datetime
 
-    from trainer.log.record import TOLERANCE, SessionHeader
+    from trainer.log.record import SessionHeader
 
     return SessionHeader(
         id=session_id,
@@ -184,8 +195,7 @@ def _header(
         tick_hz=task_file.task.tick_hz,
         tools=tools,
         started_at=datetime.now(UTC).isoformat(timespec="milliseconds"),
-        # A float's text holds all its bits.
-        versions=versions() | ({} if tissue is None else {TOLERANCE: repr(tissue.tolerance_mN)}),
+        versions=versions(),
         recording=None if recording is None else str(recording),
     )
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import typer
 
 if TYPE_CHECKING:
+    from trainer.anatomy.imported import Anatomy
     from trainer.curriculum import Task
 
 
@@ -32,7 +33,7 @@ def announce() -> None:
         typer.echo("compiling kernels once, which takes up to a minute…", err=True)
 
 
-def warm_up(task: Task) -> None:
+def warm_up(task: Task, anatomy: Anatomy | None = None) -> None:
     """Perform ``task`` with no sinks, so that every kernel is in memory when the clock starts.
 
     Kernels are compiled for types and not for sizes: a coarse mesh, long ticks and a hasty hand meet all of them
@@ -48,5 +49,5 @@ def warm_up(task: Task) -> None:
 
     vessels = tuple(replace(vessel, layers=9, around=8) for vessel in task.scene.vessel)
     coarse = replace(task, scene=replace(task.scene, vessel=vessels), tick_hz=20.0)
-    scene = build(coarse)
+    scene = build(coarse, anatomy=anatomy)
     run(scene, scripted_hands(Hand(speed_mm_s=30.0), coarse, scene.home, seed=0), [], Fast(coarse.tick_hz))

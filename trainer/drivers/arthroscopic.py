@@ -1,7 +1,8 @@
-"""Scripted hands of an arthroscopy: they grasp a structure at its mark, pull, tack it and cut it."""
+"""Scripted hands of an arthroscopy: they grasp a structure at its mark, pull, tack and cut it, or touch it."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from trainer.curriculum import Step, Task
 from trainer.drivers.hands import Hands, Movement
 from trainer.drivers.sight import Lost
-from trainer.geometry import Array, Rigid
+from trainer.geometry import Array, Rigid, unit
 from trainer.poses import ToolPoses
 from trainer.profile import Hand
 from trainer.view import View
@@ -22,8 +23,16 @@ FIRM = 0.9  # closure that holds
 PULL_PACE = 0.15  # speed of a pull, as a share of the hand's
 PULL_BEYOND = 1.15  # a pull goes so much further than the step asks: tissue gives way in the jaws
 SNIP_MM = 4.0  # how far scissors go on after each snip
+ROW_MM = 2.0  # to either side, what one row of snips cuts
+OVERLAP_MM = 1.5  # a row goes so far beyond the nearest edge of what is left
+STRANDS_MM = (0.0, 3.0, -3.0, 6.0, -6.0)  # where strands are sought that cannot be seen
+EDGE_MM = 1.0  # and so much further ahead
+MOST_ROWS = 12
 TRIES = 5  # at catching tissue
-MOST_SNIPS = 8
+INSIDE = 0.2  # detours in the joint, which is narrow, as a share of those outside
+NEAR_MM = 6.0  # from here on a probe feels its way
+FEEL_MM, FEEL_PACE = 0.2, 0.1  # in steps of this, at this share of the hand's speed
+LATE = 1.5  # how much further it presses after a touch, in errors of its aim
 WATCH_S = 2.0  # how long the hand looks whether cut ends draw apart
 
 
@@ -41,8 +50,9 @@ class ArthroscopicHands(Hands):
         self._view: View
         self._home = [home.world_from_tool(i) for i in range(len(home.closure))]
         kinds = [i.kind for i in task.scene.instrument]
-        self._grasper = kinds.index("grasper")
-        self._scissors = kinds.index("scissors") if "scissors" in kinds else -1
+        self._grasper, self._scissors, self._probe = (
+            kinds.index(kind) if kind in kinds else -1 for kind in ("grasper", "scissors", "probe")
+        )
 
     def _begin(self, view: View) -> None:
         self._view = view
@@ -61,6 +71,8 @@ class ArthroscopicHands(Hands):
                 yield from self._tack()
             elif step.kind == "cut":
                 yield from self._cut(step)
+            elif step.kind == "probe":
+                yield from self._feel(step)
             else:
                 yield from self._wait(WATCH_S)
         yield from self._wait(0.5)
@@ -77,7 +89,7 @@ class ArthroscopicHands(Hands):
 
     def _pull(self, step: Step) -> Movement:
         here = self._pose[self._grasper]
-        way = np.array(step.place_mm) - here.position
+        way = self._view.place(np.array(step.place_mm)) - here.position
         size = float(np.linalg.norm(way))
         far = max(size, PULL_BEYOND * step.at_least_mm)
         target = Rigid(here.position + way / size * far + self._miss(), here.quaternion)
@@ -91,23 +103,77 @@ class ArthroscopicHands(Hands):
         yield from self._back(self._grasper)
 
     def _cut(self, step: Step) -> Movement:
-        """Snip across the structure at its mark, a little further each time, until it is severed."""
-        tool, done = self._scissors, self._view.steps_done
-        mark = self._view.tissue(step.structure, np.array(step.place_mm)) + self._miss()
-        ahead = self._home[tool].matrix[:, 0]
-        start = mark - SNIP_MM * ahead
-        yield from self._reach(tool, start)
-        for snip in range(MOST_SNIPS):
-            yield from self._jaws(tool, 1.0)
+        """Snip across the structure at its mark, a row beside the other, until it is severed."""
+        tool, done, place = self._scissors, self._view.steps_done, np.array(step.place_mm)
+        mark = self._view.tissue(step.structure, place) + self._miss()
+        ahead, aside = self._home[tool].matrix[:, 0], self._home[tool].matrix[:, 1]
+        before = math.inf
+        for strand in range(MOST_ROWS):
+            left = self._view.uncut(step.structure, place) - mark
+            if 0 < len(left) < before:  # what still holds and is nearest
+                nearest = min((left @ aside).tolist(), key=abs)
+                row = nearest + math.copysign(OVERLAP_MM, nearest)
+                depth = (left @ ahead)[np.abs(left @ aside - row) < ROW_MM]
+                nearest, farthest = float(depth.min()), float(depth.max()) + EDGE_MM
+            else:  # a strand that cannot be seen
+                row = STRANDS_MM[strand % len(STRANDS_MM)]
+                nearest, farthest = -SNIP_MM, 2.0 * SNIP_MM
+            before = len(left) or math.inf
+            yield from self._snip_through(mark + row * aside, nearest, farthest)
             if self._view.steps_done > done:
-                break
+                return
+        raise Lost("the tissue is not cut through")
+
+    def _snip_through(self, place: Array, nearest: float, farthest: float) -> Movement:
+        """One row of snips, a little further each time, from ``nearest`` to ``farthest`` mm ahead of ``place``."""
+        tool, done = self._scissors, self._view.steps_done
+        ahead = self._home[tool].matrix[:, 0]
+        deep = nearest + SNIP_MM
+        yield from self._reach(tool, place + deep * ahead)
+        while True:
+            yield from self._jaws(tool, 1.0)
             yield from self._jaws(tool, 0.0)
-            onwards = start + (snip + 1) * SNIP_MM * ahead
-            yield from self._glide(tool, Rigid(onwards, self._pose[tool].quaternion), 0.5)
-        else:
-            raise Lost("the tissue is not cut through")
-        yield from self._jaws(tool, 0.0)
+            if self._view.steps_done > done or deep >= farthest:
+                break
+            deep = min(deep + SNIP_MM, farthest)
+            yield from self._glide(tool, Rigid(place + deep * ahead, self._pose[tool].quaternion), 0.5)
         yield from self._back(tool)
+
+    def _feel(self, step: Step) -> Movement:
+        """Come in through the portal, go straight to a structure until it is felt, and back to the portal."""
+        tool, done = self._probe, self._view.steps_done
+        spec = self._task.scene.instrument[tool]
+        portal = self._view.place(np.array(spec.portal_mm or spec.home_mm))
+        for _ in range(TRIES):
+            place = self._view.in_sight(step.structure, portal)
+            if place is None:
+                raise Lost(f"no straight way leads to the {step.structure}")
+            place = place + self._miss()
+            yield from self._go(tool, portal)
+            wander = self._hand.wander_mm
+            self._hand = replace(self._hand, wander_mm=INSIDE * wander)
+            yield from self._go(tool, place - NEAR_MM * unit(place - portal), 0.5)
+            self._hand = replace(self._hand, wander_mm=0.0)
+            yield from self._press(tool, unit(place - portal))
+            self._hand = replace(self._hand, wander_mm=INSIDE * wander)
+            yield from self._go(tool, portal, 0.5)
+            self._hand = replace(self._hand, wander_mm=wander)
+            if self._view.steps_done > done:
+                return
+        raise Lost(f"the {step.structure} is not found")
+
+    def _press(self, tool: int, way: Array) -> Movement:
+        """Feel for something along ``way``; who aims badly stops late, too."""
+        for _ in range(math.ceil(2.0 * NEAR_MM / FEEL_MM)):
+            here = self._pose[tool].position
+            if self._view.touched(tool):
+                yield from self._go(tool, here + LATE * self._hand.aim_error_mm * way, FEEL_PACE)
+                return
+            yield from self._go(tool, here + FEEL_MM * way, FEEL_PACE)
+
+    def _go(self, tool: int, place: Array, pace: float = 1.0) -> Movement:
+        """Come to ``place`` as it is turned now."""
+        yield from self._glide(tool, Rigid(place, self._pose[tool].quaternion), pace)
 
     def _reach(self, tool: int, place: Array) -> Movement:
         """Come to ``place`` the way the instrument points at home."""

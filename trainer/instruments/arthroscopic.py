@@ -45,15 +45,19 @@ def parts() -> tuple[Blade, Blade, Blade]:
     rings = [np.column_stack([np.full(4, x), thick * section[:, 0], section[:, 1]])
              for x, thick in ((0.0, ROOT_MM), (JAW_MM, TIP_MM))]  # fmt: skip
     upper, triangles = _prism(*rings)
-    turn = np.linspace(0.0, 2.0 * math.pi, _AROUND, endpoint=False)
-    circle = SHAFT_RADIUS_MM * np.column_stack([np.cos(turn), np.sin(turn)])
-    shaft, sides = _prism(*(np.column_stack([np.full(_AROUND, x), circle]) for x in (-SHAFT_MM, 0.0)))
     lower = upper * np.array([1.0, -1.0, 1.0])
     return (
         Blade("upper", upper, triangles),
         Blade("lower", lower, np.ascontiguousarray(triangles[:, ::-1])),
-        Blade("shaft", shaft, sides),
+        cylinder("shaft", SHAFT_RADIUS_MM, -SHAFT_MM, 0.0),
     )
+
+
+def cylinder(name: str, radius_mm: float, from_mm: float, to_mm: float) -> Blade:
+    """A closed cylinder about the x axis."""
+    turn = np.linspace(0.0, 2.0 * math.pi, _AROUND, endpoint=False)
+    circle = radius_mm * np.column_stack([np.cos(turn), np.sin(turn)])
+    return Blade(name, *_prism(*(np.column_stack([np.full(_AROUND, x), circle]) for x in (from_mm, to_mm))))
 
 
 def part_poses(world_from_tool: Rigid, closure: float) -> tuple[Array, Array]:

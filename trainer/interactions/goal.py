@@ -17,6 +17,8 @@ def reached(world: World, step: Step, used: set[int]) -> bool:
     """Whether ``step`` is reached now; a pass of the needle counts for one step only and is put into ``used``."""
     if step.kind in TISSUE_STEPS:
         return world.region is not None and _handled(world.region, step)
+    if step.kind == "probe":
+        return world.region is not None and step.structure in world.region.inside
     if step.kind == "drive":
         passes = _driven(world, step) - used
         used |= passes

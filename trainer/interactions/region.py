@@ -6,18 +6,33 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from trainer.anatomy import section
+from trainer.anatomy import block, library, section
+from trainer.anatomy.imported import Anatomy
 from trainer.anatomy.structures import number_of, structures
 from trainer.config import ConfigError
-from trainer.curriculum import AnatomySpec, TissueSpec
-from trainer.geometry import Array, Rigid
+from trainer.curriculum import AnatomySpec, Task, TissueSpec
+from trainer.geometry import Array, Rigid, lengthwise
 from trainer.mechanics import volume as volumes
+from trainer.mechanics.density_field import DensityField, density_field
 from trainer.mechanics.incision import Change
 from trainer.mechanics.islands import islands
-from trainer.mechanics.volume import FREE, PRESENT, Indices, Material, Triple, Volume, VolumeError, VolumeState
+from trainer.mechanics.volume import (
+    FREE,
+    PRESENT,
+    STEPS,
+    Indices,
+    Material,
+    Triple,
+    Volume,
+    VolumeError,
+    VolumeState,
+    grid_strides,
+)
 
 #: Bits of an element that may be moved by whoever holds it.
 LOOSE = FREE | PRESENT
+#: A ligament grows into bone over this part of its length at each end; in between it lies against it. Assumed.
+INSERTION = 0.25
 
 
 @dataclass
@@ -39,24 +54,43 @@ class Stroke:
 
 
 @dataclass
+class Touch:
+    """What the tip of one probe presses on."""
+
+    elements: Indices = field(default_factory=lambda: np.empty(0, np.int32))  # (k,) that it pushes aside
+    soft: str = ""  # the structure of the last of them
+    outwards: Array = field(default_factory=lambda: np.zeros(3))  # (3,) out of what is rigid; zeros away from it
+    met: set[str] = field(default_factory=set)  # structures, since it began to touch
+    force_mN: float = 0.0  # on the tip, after the last movement
+
+
+@dataclass
 class Region:
-    """A volume in the scene. Element (0, 0, 0) rests at ``origin``; the axes are the scene's."""
+    """A volume in the scene. Element (0, 0, 0) rests at ``origin``; the axes are the scene's.
+
+    The volume is no larger than what moves and what that is grown to; ``labels`` reach as far as the task does.
+    """
 
     volume: Volume
     state: VolumeState
     origin: Array  # (3,) mm
+    labels: np.ndarray  # (lx, ly, lz) uint8 of everything at rest, on the volume's grid
+    corner: Array  # (3,) mm, where the first of them is
     flat: int  # the axis along which there is one layer only, or -1: depth along it does not count
     tissue: dict[str, TissueSpec]  # by structure
     names: dict[int, str]  # of the labels
     elements: dict[str, Indices]  # of each movable structure
     held: list[Hold | None]  # by instrument
     strokes: list[Stroke | None]  # by instrument, while its blades close
-    inside: list[str]  # by instrument: the rigid structure that its tip is in, or ""
+    inside: list[str]  # by instrument: the structure that its tip is in or a probe's touches, or ""
+    touch: list[Touch]  # by instrument
+    hard: DensityField | None  # the field of what is rigid, for probes
     tacked: np.ndarray  # (n,) bool, fixed by a tack
     opened: dict[str, Indices] = field(default_factory=dict)  # elements of a structure that lost a link
     severed: set[str] = field(default_factory=set)  # structures that hold together no more
     torn_through: str = ""  # the first structure that was severed by a pull
     pull_max_mN: float = 0.0
+    press_max_mN: float = 0.0  # the greatest force on the tip of a probe
 
     def places(self, elements: Indices) -> Array:
         """Where ``elements`` (k,) are now: (k, 3) mm, scene."""
@@ -80,10 +114,10 @@ class Region:
 
     def structure_at(self, place: Array) -> str:
         """The structure that has its rest at ``place`` (3,) mm of the scene, or ""."""
-        index = np.floor((place - self.origin) / np.array(self.volume.spacing_mm) + 0.5).astype(int)
-        if (index < 0).any() or (index >= self.volume.shape).any():
+        index = np.floor((place - self.corner) / np.array(self.volume.spacing_mm) + 0.5).astype(int)
+        if (index < 0).any() or (index >= self.labels.shape).any():
             return ""
-        return self.names.get(int(self.volume.labels[tuple(index)]), "")
+        return self.names.get(int(self.labels[tuple(index)]), "")
 
     def mm3(self, elements: Indices) -> float:
         """What ``elements`` (k,) take up at rest."""
@@ -128,36 +162,90 @@ class Region:
         return float(found.mean()) if len(found) else 0.0
 
 
-def build(spec: AnatomySpec, instruments: int) -> Region:
-    """The region at rest. Raises ConfigError for an anatomy or structures that are not there."""
-    labels, spacing, origin = section.build(section.load(spec.section))
-    for tissue in spec.tissue:
-        for structure in (tissue.structure, *tissue.grown_to):
-            if structure not in structures():
-                raise ConfigError(f"unknown structure '{structure}'; known: {', '.join(structures())}")
+def build(task: Task, spec: AnatomySpec, anatomy: Anatomy | None = None) -> Region:
+    """The region of a task at rest, of ``anatomy`` or of the knee that its ``spec`` names.
+
+    Raises ConfigError for an anatomy or structures that are not there.
+    """
+    needed = dict.fromkeys([t.structure for t in spec.tissue] + [s.structure for s in task.step])
+    for structure in (*needed, *(end for t in spec.tissue for end in t.grown_to)):
+        if structure not in structures():
+            raise ConfigError(f"unknown structure '{structure}'; known: {', '.join(structures())}")
     free = {number_of(t.structure): _material(t) for t in spec.tissue}
     grown = {(number_of(t.structure), number_of(end)) for t in spec.tissue for end in t.grown_to}
+    labels, spacing, corner, name = _labels(spec, anatomy)
+    missing = [structure for structure in needed if not (labels == number_of(structure)).any()]
+    if missing:
+        raise ConfigError(f"anatomy '{name}' has no {' and no '.join(missing)} where the task takes place")
+    near = np.argwhere(np.isin(labels, list(free)))
+    lowest, highest = np.maximum(near.min(axis=0) - 1, 0), near.max(axis=0) + 2
+    part = np.ascontiguousarray(labels[tuple(slice(a, b) for a, b in zip(lowest, highest, strict=True))])
     try:
-        volume = volumes.build(labels, spacing, free, grown)
+        volume = volumes.build(part, spacing, free, grown)
     except VolumeError as error:
-        raise ConfigError(f"anatomy '{spec.section}': {error}") from None
-    flat_labels = labels.reshape(-1)
+        raise ConfigError(f"anatomy '{name}': {error}") from None
+    state = volumes.start(volume)
     thin = [axis for axis, n in enumerate(labels.shape) if n == 1]
+    elements = {
+        t.structure: np.flatnonzero(part.reshape(-1) == number_of(t.structure)).astype(np.int32) for t in spec.tissue
+    }
+    if spec.knee is not None:
+        for structure, own in elements.items():
+            if structures()[structure].kind == "ligament":
+                _lay_against_bone(volume, state, own)
+    instruments = len(task.scene.instrument)
     return Region(
         volume=volume,
-        state=volumes.start(volume),
-        origin=origin,
+        state=state,
+        origin=corner + lowest * np.array(spacing),
+        labels=labels,
+        corner=corner,
         flat=thin[0] if thin else -1,
         tissue={t.structure: t for t in spec.tissue},
         names={s.number: name for name, s in structures().items()},
-        elements={
-            t.structure: np.flatnonzero(flat_labels == number_of(t.structure)).astype(np.int32) for t in spec.tissue
-        },
+        elements=elements,
         held=[None] * instruments,
         strokes=[None] * instruments,
         inside=[""] * instruments,
-        tacked=np.zeros(labels.size, dtype=bool),
+        touch=[Touch() for _ in range(instruments)],
+        hard=_hard(spec, labels, spacing, corner),
+        tacked=np.zeros(part.size, dtype=bool),
     )
+
+
+def _hard(spec: AnatomySpec, labels: np.ndarray, spacing: Triple, corner: Array) -> DensityField | None:
+    """What presses on a probe's tip; None where the task tells no hardness."""
+    if spec.hardness_mN_per_mm is None:
+        return None
+    rigid = (labels > 0) & ~np.isin(labels, [number_of(t.structure) for t in spec.tissue])
+    hardness = spec.hardness_mN_per_mm.value
+    # No device's limit: what a hand presses with is to be told, not what a motor can.
+    return density_field(rigid, spacing, Rigid(corner, np.array([1.0, 0.0, 0.0, 0.0])), hardness, 1e9)
+
+
+def _labels(spec: AnatomySpec, anatomy: Anatomy | None) -> tuple[np.ndarray, Triple, Array, str]:
+    """All labels, their spacing, where the first is, and what to call them."""
+    if spec.knee is None:
+        labels, spacing, corner = section.build(section.load(spec.section))
+        return labels, spacing, corner, spec.section
+    knee = anatomy or library.load(spec.knee.name, spec.knee.voxel_mm)
+    labels, corner = block.cut_out(knee, spec.knee)
+    return labels, (spec.knee.voxel_mm,) * 3, corner, knee.name
+
+
+def _lay_against_bone(volume: Volume, state: VolumeState, elements: Indices) -> None:
+    """Break the links of a ligament to anything else but near its ends: there alone it is grown to it."""
+    rest = volume.rest(elements)
+    along = rest @ lengthwise(rest)
+    low, high = float(along.min()), float(along.max())
+    middle = elements[np.abs(along - 0.5 * (low + high)) < (0.5 - INSERTION) * (high - low)]
+    labels, strides = volume.labels.reshape(-1), grid_strides(volume)
+    for d in range(len(STEPS)):
+        linked = middle[(state.links[middle] & (1 << d)) != 0]
+        others = linked + strides[d]
+        apart = labels[others] != labels[linked]
+        state.links[linked[apart]] &= np.uint8(0xFF ^ (1 << d))
+        state.links[others[apart]] &= np.uint8(0xFF ^ (1 << (d ^ 1)))
 
 
 def _material(t: TissueSpec) -> Material:

@@ -9,7 +9,7 @@ import numpy as np
 
 from trainer.anatomy import vessel as vessels
 from trainer.geometry import Array, Rigid
-from trainer.interactions import goal, thread_pull
+from trainer.interactions import goal, sight, thread_pull
 from trainer.interactions.world import World
 from trainer.poses import ToolPoses
 from trainer.view import HoleView, View
@@ -82,12 +82,30 @@ class SceneView(View):
     def gap_mm(self) -> float:
         return goal.gap_mm(self._world)
 
+    def place(self, place_mm: Array) -> Array:
+        return self._world.world_from_scene.apply(place_mm)
+
     def tissue(self, structure: str, place_mm: Array) -> Array:
         world = self._world
         assert world.region is not None
         elements = world.region.elements[structure]
         away = np.linalg.norm(world.region.rest(elements) - place_mm, axis=1)
         return world.world_from_scene.apply(world.region.places(elements[[np.argmin(away)]])[0])
+
+    def uncut(self, structure: str, place_mm: Array) -> Array:
+        world = self._world
+        assert world.region is not None
+        return world.world_from_scene.apply(world.region.places(sight.uncut_at(world.region, structure, place_mm)))
+
+    def in_sight(self, structure: str, eye: Array) -> Array | None:
+        world = self._world
+        assert world.region is not None
+        place = sight.in_sight(world.region, structure, world.scene_from_world.apply(eye))
+        return None if place is None else world.world_from_scene.apply(place)
+
+    def touched(self, tool: int) -> str:
+        assert self._world.region is not None
+        return self._world.region.inside[tool]
 
     @cached_property
     def tissue_holders(self) -> tuple[int, ...]:

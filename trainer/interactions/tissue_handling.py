@@ -12,7 +12,7 @@ from trainer.curriculum import InstrumentSpec
 from trainer.events import Cut, Grasp, Probe, Release, Slip, Tack, Tear
 from trainer.geometry import Array
 from trainer.instruments.arthroscopic import edges
-from trainer.interactions import giving_way, grasp
+from trainer.interactions import giving_way, grasp, portal, probing
 from trainer.interactions.region import LOOSE, Hold, Region, Stroke
 from trainer.interactions.world import World
 from trainer.mechanics.elastic_relaxation import force_on, relax
@@ -27,19 +27,27 @@ def move(world: World, closures: Array, start_s: float, span_s: float) -> None:
     if region is None:
         return
     end_s = start_s + span_s
+    world.tissue_force_mN = 0.0
     for i, spec in enumerate(world.task.scene.instrument):
+        portal.pivot(world, i, end_s)
         if spec.kind == "grasper":
             _close_and_open(world, region, i, spec, float(closures[i]), end_s)
         elif spec.kind == "scissors":
             _snip(world, region, i, float(closures[i]), end_s)
+        elif spec.kind == "probe":
+            probing.push(world, region, i)
     for i, hold in enumerate(region.held):
         if hold is not None:
             _lead(world, region, i, hold)
+    _keep_limits_at_tacks(region)
     _tear(world, region, end_s)
     relax(region.volume, region.state, span_s)
     _judge_pulls(world, region, end_s)
-    for i in range(len(world.jaws)):
-        _touch(world, region, i, end_s)
+    for i, spec in enumerate(world.task.scene.instrument):
+        if spec.kind == "probe":
+            probing.feel(world, region, i, end_s)
+        else:
+            _touch(world, region, i, end_s)
 
 
 def _close_and_open(
@@ -105,6 +113,15 @@ def _lead(world: World, region: Region, tool: int, hold: Hold) -> None:
         to[:, region.flat] = 0.0
     if (to.astype(np.float32) != region.state.u[:, hold.elements].T).any():
         drag(region.volume, region.state, hold.elements, to)
+
+
+def _keep_limits_at_tacks(region: Region) -> None:
+    """Relaxation asks for no limits; beside what is held the next drag restores them, beside a tack nobody would."""
+    held = [h.elements for h in region.held if h is not None]
+    tacked = np.flatnonzero(region.tacked).astype(np.int32)
+    tacked = np.setdiff1d(tacked, np.concatenate(held)) if held else tacked
+    if len(tacked) and region.state.awake is not None:
+        drag(region.volume, region.state, tacked, region.state.u[:, tacked].T)
 
 
 def _snip(world: World, region: Region, tool: int, closure: float, time_s: float) -> None:
@@ -174,8 +191,9 @@ def _judge_pulls(world: World, region: Region, time_s: float) -> None:
             world.emit(
                 Slip, time_s, world.tools[i], target="tissue", body=hold.structure, load_mN=hold.pull_mN, limit_mN=limit
             )
-    world.tissue_force_mN = max((h.pull_mN for h in region.held if h is not None), default=0.0)
-    giving_way.check_limit(world, "tissue_pull", world.tissue_force_mN, "", "", time_s)
+    pull = max((h.pull_mN for h in region.held if h is not None), default=0.0)
+    world.tissue_force_mN = max(world.tissue_force_mN, pull)
+    giving_way.check_limit(world, "tissue_pull", pull, "", "", time_s)
 
 
 def _touch(world: World, region: Region, tool: int, time_s: float) -> None:

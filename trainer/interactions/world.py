@@ -76,6 +76,7 @@ class Jaw:
     pose: Rigid
     closure: float
     seen: bool = True
+    inside: bool = False  # whether its tip has gone through its portal
     lost_at: float = 0.0  # time at which the device last lost the instrument
     target: str = ""  # needle, thread, wall, tissue, or nothing
     since: int = 0  # order of grasping; who holds the needle longest leads it

@@ -14,6 +14,8 @@ from trainer.poses import ToolPoses
 #: The key of ``SessionHeader.versions`` that holds the force, mN, at which the tissue counted as in equilibrium. It was
 #: chosen by measurements that may change, so a replay takes it from here.
 TOLERANCE = "tolerance_mN"
+#: The keys that hold the knee that was practised in, a name or a folder, and what its fingerprint was then.
+ANATOMY, ANATOMY_SHA256 = "anatomy", "anatomy_sha256"
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,7 @@ class SessionHeader:
     tick_hz: float
     tools: tuple[str, ...]
     started_at: str  # UTC, ISO 8601
-    versions: dict[str, str]  # trainer, python, numpy, numba, machine; TOLERANCE where the scene has tissue
+    versions: dict[str, str]  # trainer, python, numpy, numba, machine; the keys above where the scene has such
     recording: str | None  # path of the .rrd
 
 

@@ -250,8 +250,8 @@ def overstretched(volume: Volume, state: VolumeState) -> np.ndarray:
 
 def tear(volume: Volume, state: VolumeState) -> Change:
     """Break the links that are beyond their limits and stay so although their ends were moved."""
+    found = overstretched(volume, state)
     for _ in range(ATTEMPTS):
-        found = overstretched(volume, state)
         loose = ((state.links[found[:, 0]] & state.links[found[:, 1]]) & FREE) != 0
         if not loose.any():
             break
@@ -260,11 +260,12 @@ def tear(volume: Volume, state: VolumeState) -> Change:
             low, high = volume.low[m[0], m[1], d], volume.high[m[0], m[1], d]
             to = np.clip(state.u[:, f], state.u[:, e] + low, state.u[:, e] + high)
             drag(volume, state, np.array([f]), to)
+        found = overstretched(volume, state)
     seams = state.seams
     apart = (state.u[:, seams.ends[:, 1]] - state.u[:, seams.ends[:, 0]]).T
     slack = TEAR_SLACK * min(volume.spacing_mm)
     torn = np.any((apart > seams.high + slack) | (apart < seams.low - slack), axis=1)
-    return _break(volume, state, overstretched(volume, state), torn)
+    return _break(volume, state, found, torn)
 
 
 def erase(volume: Volume, state: VolumeState, elements: Indices) -> Change:

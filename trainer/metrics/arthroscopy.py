@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from trainer.curriculum import Step, Task
-from trainer.events import Cut, Event, Grasp, Probe, StepDone, Tack, Tear
+from trainer.events import Cut, Event, Grasp, PortalEnter, Probe, StepDone, Tack, Tear
 from trainer.geometry import Rigid, quaternion_from_euler_deg
 from trainer.metrics.performance import Performance
 from trainer.metrics.registry import metric
@@ -26,6 +26,16 @@ def cuts(task: Task) -> bool:
 def grasps(task: Task) -> bool:
     """Whether the task has a structure to be grasped."""
     return any(s.kind == "grasp" for s in task.step)
+
+
+def probes(task: Task) -> bool:
+    """Whether the task has a structure to be touched with a probe."""
+    return any(s.kind == "probe" for s in task.step)
+
+
+def enters(task: Task) -> bool:
+    """Whether an instrument of the task goes through a portal."""
+    return any(i.portal_mm is not None for i in task.scene.instrument)
 
 
 def _structure(event: Event) -> str:
@@ -86,6 +96,26 @@ def pull_max(performance: Performance, _: str) -> float | None:
     """Largest pull of an instrument on tissue that it held; None where nothing was held."""
     held = any(isinstance(e, Grasp) and e.target == "tissue" for e in performance.record.events)
     return performance.end.pull_max_mN if held and performance.end is not None else None
+
+
+@metric("probe_force_max_mN", "mN", probes, better="lower")
+def probe_force(performance: Performance, _: str) -> float | None:
+    """Largest force on the tip of a probe; None where it touched nothing."""
+    touched = bool(performance.events(Probe))
+    return performance.end.press_max_mN if touched and performance.end is not None else None
+
+
+@metric("landmarks_touched_count", "count", probes)
+def landmarks_touched(performance: Performance, _: str) -> float:
+    """How many of the structures that the task wants touched were touched."""
+    asked = {s.structure for s in performance.task.step if s.kind == "probe"}
+    return float(len(asked & {e.body for e in performance.events(Probe)}))
+
+
+@metric("portal_entry_count", "count", enters, better="lower")
+def portal_entries(performance: Performance, _: str) -> float:
+    """How often an instrument went in through its portal."""
+    return float(len(performance.events(PortalEnter)))
 
 
 @metric("retraction_mm", "mm", cuts)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from trainer.curriculum import Task
-from trainer.events import Break, Contact, Cut, Drop, Event, Grasp, Overforce, Pierce, Slip, Tear
+from trainer.events import Break, Contact, Cut, Drop, Event, Grasp, Overforce, Pierce, Probe, Slip, Tear
 from trainer.metrics.performance import Performance
 from trainer.metrics.registry import metric, pierces
 
@@ -41,14 +41,14 @@ def wall_grasps(performance: Performance, _: str) -> float:
 def _touched(event: Event) -> bool:
     if isinstance(event, Grasp):
         return event.target in ("wall", "tissue")
-    return isinstance(event, Contact | Pierce | Overforce | Cut)
+    return isinstance(event, Contact | Pierce | Overforce | Cut | Probe)
 
 
-@metric("overforce_count", "count", better="lower", version="2")
+@metric("overforce_count", "count", better="lower", version="3")
 def overforces(performance: Performance, _: str) -> float | None:
     """How often a force or pressure rose above the task's limits; once per excursion.
 
-    None where neither needle nor jaws touched a wall or tissue: no touch is not a gentle one.
+    None where neither needle, jaws nor tip touched anything: no touch is not a gentle one.
     """
     return _count(performance, Overforce) if any(map(_touched, performance.record.events)) else None
 

@@ -17,6 +17,8 @@ from trainer.events import (
     Grasp,
     Overforce,
     Pierce,
+    PortalEnter,
+    PortalExit,
     Probe,
     PullThrough,
     Release,
@@ -179,7 +181,11 @@ def describe(event: Event) -> str:
         case Tack():
             return f"{event.body}, {event.volume_mm3:.0f} mm³ at {event.force_mN:.0f} mN"
         case Probe():
-            return event.body
+            return f"{event.body}, {event.force_mN:.0f} mN" if event.force_mN else event.body
+        case PortalEnter():
+            return "in through the portal"
+        case PortalExit():
+            return "out of the portal"
         case Tear():
             return f"{event.wall} wall of {event.body} at {event.force_mN:.0f} mN"
         case Overforce():

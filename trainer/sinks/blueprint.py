@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import rerun.blueprint as rrb
 
+from trainer.sinks.surface import Layout
+
 BACKGROUND = (24, 30, 38)
+PICTURES = ("surface", "section", "volume")
 
 
-def blueprint(eye_mm: tuple[float, float, float], look_at_mm: tuple[float, float, float]) -> rrb.Blueprint:
+def blueprint(layout: Layout) -> rrb.Blueprint:
     """The arrangement that travels inside the recording, and where its eye is."""
     scene = rrb.Spatial3DView(
         origin="/world",
@@ -15,7 +18,7 @@ def blueprint(eye_mm: tuple[float, float, float], look_at_mm: tuple[float, float
         background=rrb.Background(color=BACKGROUND),
         line_grid=rrb.LineGrid3D(visible=False),
         eye_controls=rrb.EyeControls3D(
-            kind=rrb.Eye3DKind.Orbital, position=eye_mm, look_target=look_at_mm, eye_up=(0.0, 0.0, 1.0)
+            kind=rrb.Eye3DKind.Orbital, position=layout.eye_mm, look_target=layout.look_at_mm, eye_up=(0.0, 0.0, 1.0)
         ),
     )
     forces = rrb.TimeSeriesView(origin="/force", name="Force (mN)")
@@ -27,9 +30,13 @@ def blueprint(eye_mm: tuple[float, float, float], look_at_mm: tuple[float, float
         origin="/events", name="Events", columns=rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"])
     )
     scores = rrb.TextDocumentView(origin="/scores", name="Scores")
+    pictures = rrb.Horizontal(
+        *(rrb.Spatial2DView(origin=f"/pictures/{name}", name=name.capitalize()) for name in PICTURES), name="Pictures"
+    )
+    seen = scene if layout.pictures is None else rrb.Vertical(scene, pictures, row_shares=[2, 1])
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Vertical(scene, states, row_shares=[3, 1]),
+            rrb.Vertical(seen, states, row_shares=[3, 1]),
             rrb.Vertical(forces, rrb.Tabs(scores, closures), log, row_shares=[2, 2, 3]),
             column_shares=[3, 2],
         ),

@@ -105,6 +105,7 @@ class RecordingSink:
         self._ticks_per_frame = max(1, math.ceil(tick_hz / max_hz - 1e-9))
         self._tick_hz = tick_hz
         self._next_frame = 0
+        self._draw = layout.pictures is not None
         self._next_flush = 0
         self._last = (0, 0.0)
         self._steps = [str(step["name"]) for step in tomllib.loads(header.task_toml).get("step", [])]
@@ -121,7 +122,7 @@ class RecordingSink:
             batcher_config=rr.ChunkBatcherConfig(flush_tick=datetime.timedelta(days=1)),
         )
         self._stream.set_log_time_enabled(False)
-        self._file = RrdFile(self.path, self._stream, blueprint(layout.eye_mm, layout.look_at_mm))
+        self._file = RrdFile(self.path, self._stream, blueprint(layout))
         self._log_header()
         self._log_layout()
 
@@ -190,10 +191,16 @@ class RecordingSink:
         for event in moment.events:
             self._set_time(event.tick, event.time_s)
             self._log_event(event)
+            # They cost as much as many frames: one drawing for each step of the task, one at the end.
+            self._draw |= isinstance(event, StepDone | TaskDone)
         self._last = (moment.tick, moment.time_s)
         if moment.frame is not None:
             self._set_time(*self._last)
             self._log_frame(moment.frame)
+            if self._draw and self._layout.pictures is not None:
+                self._draw = False
+                for name, picture in self._layout.pictures(moment.frame).items():
+                    self._stream.log(f"pictures/{name}", rr.Image(picture))
             for tool, closure in zip(self._header.tools, moment.closure, strict=True):
                 self._stream.log(f"closure/{tool}", rr.Scalars(closure))
 
@@ -227,8 +234,16 @@ class RecordingSink:
         layout = self._layout
         log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         for surface in layout.surfaces:
-            topology = rr.Mesh3D.from_fields(triangle_indices=surface.triangles, albedo_factor=surface.rgba)
-            log(f"world/{surface.name}", topology, static=True)
+            if surface.fixed is None:
+                mesh = rr.Mesh3D.from_fields(triangle_indices=surface.triangles, albedo_factor=surface.rgba)
+            else:
+                mesh = rr.Mesh3D(
+                    vertex_positions=surface.fixed,
+                    triangle_indices=surface.triangles,
+                    vertex_normals=_normals(surface.fixed, surface.triangles),
+                    albedo_factor=surface.rgba,
+                )
+            log(f"world/{surface.name}", mesh, static=True)
         for part in layout.parts:
             mesh = rr.Mesh3D(
                 vertex_positions=part.vertices,
@@ -255,7 +270,8 @@ class RecordingSink:
 
     def _log_frame(self, frame: Frame) -> None:
         log = self._stream.log
-        for surface, vertices in zip(self._layout.surfaces, frame.vertices, strict=True):
+        surfaces = [surface for surface in self._layout.surfaces if surface.fixed is None]
+        for surface, vertices in zip(surfaces, frame.vertices, strict=True):
             mesh = rr.Mesh3D.from_fields(
                 vertex_positions=_rounded(vertices, VERTEX_STEP_MM),
                 vertex_normals=_rounded(_normals(vertices, surface.triangles), NORMAL_STEP),

@@ -5,7 +5,7 @@ A sink has ``tick(step)`` for every tick, ``close()`` at the end, and is made fo
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -23,6 +23,7 @@ class Surface:
     name: str  # e.g. vessel/A
     triangles: np.ndarray  # (f, 3) int32
     rgba: tuple[int, int, int, int]
+    fixed: Array | None = None  # (v, 3) mm, world, of what does not move; None where a frame tells
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,8 @@ class Layout:
     needle_radius_mm: float
     thread_radius_mm: float
     clouds: tuple[Cloud, ...] = ()
+    #: Draws pictures (height, width, 3) uint8 of a frame, by name, in any thread; None where there is nothing to draw.
+    pictures: Callable[[Frame], Mapping[str, np.ndarray]] | None = None
     #: Where the eye is and what it looks at, mm: on a stitch from above and the near side, as through a microscope.
     eye_mm: tuple[float, float, float] = (1.4, -4.8, 3.9)
     look_at_mm: tuple[float, float, float] = (0.15, 0.0, 0.75)
@@ -64,7 +67,7 @@ class Layout:
 class Frame:
     """A copy of the scene at one tick, safe to hand to another thread."""
 
-    vertices: tuple[Array, ...]  # per surface, (v, 3) mm, world
+    vertices: tuple[Array, ...]  # per surface that is not fixed, (v, 3) mm, world
     part_position: Array  # (p, 3) mm, world_from_part
     part_quaternion: Array  # (p, 4) wxyz
     needle_position: Array | None  # (3,) world_from_needle
