@@ -24,6 +24,7 @@ hardly ever leaves them, and does not ask.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -180,15 +181,55 @@ def relax(volume: Volume, state: VolumeState, duration_s: float) -> int:
     # A billionth of a step is rounding of the sum of the ticks.
     due = math.floor(state.owed_s / step_s + 1e-9)
     state.owed_s -= due * step_s
+    constant = _constant(volume, step_s)
     for done in range(due):
         if state.awake is None:
             return done
-        sweep(volume, state, step_s, look=done == due - 1)
+        _sweep(volume, state, constant, look=done == due - 1)
     return due
 
 
 def sweep(volume: Volume, state: VolumeState, step_s: float, look: bool = True) -> None:
     """One sweep of the region that is awake; ``look`` asks whether anything still moves."""
+    _sweep(volume, state, _constant(volume, step_s), look)
+
+
+class _Constant(NamedTuple):
+    """What is the same in all sweeps of one length."""
+
+    rest: Array  # (m, 3, 3) mN/mm, see rest_stiffness
+    part: Array  # (m,) how much of the way an element goes
+    whole: Array  # (m, 3) mN/mm of all links of an element
+    ways: Singles  # (3, 3) for one linear material: parts of the differences along each axis, by component
+    linear: bool  # one linear material is all
+    h: Array  # (3,) mm
+    area: Array  # (3,) mm²
+    law: Array  # (m, 5)
+    strides: np.ndarray  # (6,)
+
+
+def _constant(volume: Volume, step_s: float) -> _Constant:
+    rest = rest_stiffness(volume)
+    part = np.array([-math.expm1(-step_s / m.time_constant_s) for m in volume.materials])
+    whole = 2.0 * rest[:, np.array(volume.shape) > 1].sum(axis=1)
+    bent = any(m.steepness or m.straight_from < math.inf or m.yield_strain for m in volume.materials)
+    # A single element has no links at all, and moves nowhere.
+    ways = part[0] * rest[0] / np.where(whole[0] > 0.0, whole[0], 1.0)
+    h = np.array(volume.spacing_mm)
+    return _Constant(
+        rest=rest,
+        part=part,
+        whole=whole,
+        ways=ways.astype(np.float32),
+        linear=len(volume.materials) == 1 and not bent,
+        h=h,
+        area=volume.element_mm3 / h,
+        law=constants(volume),
+        strides=grid_strides(volume)[:6],
+    )
+
+
+def _sweep(volume: Volume, state: VolumeState, constant: _Constant, look: bool) -> None:
     if state.awake is None:
         return
     if volume.labels.size == 1:  # nothing pulls at it
@@ -197,31 +238,26 @@ def sweep(volume: Volume, state: VolumeState, step_s: float, look: bool = True) 
     lowest = np.maximum(state.awake[0] - 1, 0)
     highest = np.minimum(state.awake[1] + 1, np.array(volume.shape, np.int32) - 1)
     box = np.stack([lowest, highest], axis=1).ravel().astype(np.int64)
-    rest = rest_stiffness(volume)
-    part = np.array([-math.expm1(-step_s / m.time_constant_s) for m in volume.materials])
-    whole = 2.0 * rest[:, np.array(volume.shape) > 1].sum(axis=1)
-    seams = _seam_ways(volume, state, rest, part, whole)
+    seams = _seam_ways(volume, state, constant.rest, constant.part, constant.whole)
     still = STILL * min(volume.spacing_mm) if look else 0.0
-    linear = not any(m.steepness or m.straight_from < math.inf or m.yield_strain for m in volume.materials)
     pieces = parts(int(box[0]), int(box[1]) + 1, int(np.prod(highest - lowest + 1, dtype=np.int64)))
     edges = {piece: [_edges(volume, u, *piece) for u in state.u] for piece in pieces}
-    h, law, strides = np.array(volume.spacing_mm), constants(volume), grid_strides(volume)[:6]
-    ways = (part[0] * rest[0] / whole[0]).astype(np.float32)
 
     def slab(piece: tuple[int, int]) -> int:
         own = np.array([piece[0], piece[1] - 1, *box[2:]])
         moving = 0
         for c, (before, last) in enumerate(edges[piece]):
             now = np.empty_like(before)
-            if linear and len(volume.materials) == 1:
-                wx, wy, wz = ways[:, c]
+            if constant.linear:
+                wx, wy, wz = constant.ways[:, c]
                 moving += smooth(
                     state.u[c], state.links, volume.shape, own, wx, wy, wz, np.float32(still), before, last, now
                 )
             else:
                 moving += answer(
-                    state.u[c], state.links, volume.labels.reshape(-1), volume.material_of, volume.shape, strides, own,
-                    c, law, h, volume.element_mm3 / h, rest, part, still, before, last, now,
+                    state.u[c], state.links, volume.labels.reshape(-1), volume.material_of, volume.shape,
+                    constant.strides, own, c, constant.law, constant.h, constant.area, constant.rest, constant.part,
+                    still, before, last, now,
                 )  # fmt: skip
         return moving
 
