@@ -113,7 +113,7 @@ class LivePoses:
                     self._trouble = ""
                 for reading in connection.read():
                     self._take(reading)
-            except DeviceError as error:
+            except (DeviceError, ConfigError) as error:  # a file that the profile names may be gone as well
                 self._trouble = str(error)
                 if connection is not None:
                     connection.close()

@@ -3,10 +3,19 @@
 from __future__ import annotations
 
 import errno
+import sys
 from contextlib import suppress
 from typing import Any
 
 import serial
+
+#: What opening a port raises: a port that goes while it is opened has the terminal's own error, no OSError.
+if sys.platform == "win32":
+    REFUSALS: tuple[type[Exception], ...] = (OSError, ValueError)
+else:
+    import termios
+
+    REFUSALS = (OSError, ValueError, termios.error)
 
 #: A read that gets nothing returns after this long, so that a thread sees soon that it is to end.
 READ_S = 0.05
@@ -31,7 +40,7 @@ def open_port(url: str, baud: int) -> Any:
         if isinstance(port, serial.Serial) and hasattr(port, "exclusive"):
             port.exclusive = True
         port.open()
-    except (OSError, ValueError) as error:
+    except REFUSALS as error:
         raise DeviceError(f"{url}: {_why(error)}") from None
     _hand_over_at_once(port)
     return port
@@ -45,8 +54,8 @@ def _hand_over_at_once(port: Any) -> None:
             ask(True)
 
 
-def _why(error: OSError | ValueError) -> str:
-    number = error.errno if isinstance(error, OSError) else None
+def _why(error: Exception) -> str:
+    number = error.args[0] if error.args else None
     if "exclusively lock" in str(error) or number in (errno.EBUSY, errno.EAGAIN):
         return "in use by another program; end that one first"
     if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.EIO):
