@@ -13,6 +13,9 @@ POSITION_ANGLES = b"Y"
 POINT = b"B"
 STREAM = b"@"
 STREAM_STOP = b"?"
+REPORT_EACH_CYCLE = b"Q"
+NO_BUTTON = b"M\x00"  # BUTTON MODE: no byte of the buttons behind a record
+NO_METAL = b"s\x00\x00"  # METAL: no byte of the field's distortion
 RUN = b"F"
 SLEEP = b"G"
 
