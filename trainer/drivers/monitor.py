@@ -77,7 +77,7 @@ class Seen:
 
 
 def seen(position: Array, ok: np.ndarray, closure: Array | None, lost: int = 0) -> Seen:
-    """Of one sensor's records: ``position`` (n, 3) mm, ``ok`` (n,) bool, ``closure`` (n,); in the ``lost`` it was not."""
+    """Of one sensor's records: ``position`` (n, 3) mm, ``ok`` (n,) bool, ``closure`` (n,); ``lost`` more are not."""
     last = np.flatnonzero(ok)
     where = None
     if len(last):
