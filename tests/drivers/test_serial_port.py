@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 import pytest
 
@@ -25,3 +26,24 @@ def test_a_port_that_goes_while_it_is_opened_is_no_such_port(monkeypatch: pytest
     finally:
         os.close(master)
         os.close(slave)
+
+
+def test_the_bytes_of_each_opening_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """pyserial begins the file that an address names anew: a port that is opened again names another one."""
+    log, asked = tmp_path / "bytes.txt", []
+
+    def opens(url: str, do_not_open: bool) -> None:
+        asked.append(url)
+        Path(url.partition("file=")[2].partition("&")[0]).write_text("bytes")
+        raise OSError
+
+    monkeypatch.setattr("serial.serial_for_url", opens)
+    for _ in range(3):
+        with pytest.raises(DeviceError):
+            open_port(f"spy://loop://?file={log}&all", 115200)
+    assert asked == [f"spy://loop://?file={log}{suffix}&all" for suffix in ("", ".2", ".3")]
+
+
+def test_an_address_without_a_port_is_one_line() -> None:
+    with pytest.raises(DeviceError, match=r"^socket://somewhere: .*its address has no port; give host:port$"):
+        open_port("socket://somewhere", 115200)

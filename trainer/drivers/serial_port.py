@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import errno
+import re
 import sys
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import serial
 
@@ -33,7 +36,9 @@ def open_port(url: str, baud: int) -> Any:
     opened, since pyserial would raise both. A pseudo-terminal has neither line; setting them before is no error there.
     """
     try:
-        port = serial.serial_for_url(url, do_not_open=True)
+        if url.startswith(("socket://", "rfc2217://")) and urlsplit(url).port is None:
+            raise ValueError("its address has no port; give host:port")
+        port = serial.serial_for_url(_fresh_log(url), do_not_open=True)
         port.baudrate = baud
         port.timeout, port.write_timeout = READ_S, WRITE_S
         port.rts, port.dtr = False, True
@@ -44,6 +49,18 @@ def open_port(url: str, baud: int) -> Any:
         raise DeviceError(f"{url}: {_why(error)}") from None
     _hand_over_at_once(port)
     return port
+
+
+def _fresh_log(url: str) -> str:
+    """The address, its log of bytes (``spy://…?file=``) under a name of its own: pyserial would begin it anew."""
+    found = re.fullmatch(r"(spy://.*[?&]file=)([^&]+)(.*)", url)
+    if found is None:
+        return url
+    log, count = found[2], 1
+    while Path(log).is_file():
+        count += 1
+        log = f"{found[2]}.{count}"
+    return f"{found[1]}{log}{found[3]}"
 
 
 def _hand_over_at_once(port: Any) -> None:
