@@ -150,11 +150,12 @@ class Minibird:
 
     def summary(self) -> dict[str, object]:
         """What was read, how late, and when and why it was not."""
+        jitter_s = self._line.jitter_s
         return {
             "driver": "minibird",
             "records": dict(sorted(self._stream.counts.items())),
-            "measured_rate_hz": round(1.0 / self._line.period_s, 3),
-            "jitter_ms": round(1e3 * self._line.jitter_s, 3),
+            "measured_rate_hz": round(self._line.rate_hz, 3),
+            "jitter_ms": None if jitter_s is None else round(1e3 * jitter_s, 3),
             "latency_ms": self._latency.summary(),
             "restarts": self._stream.restarts,
             **self._losses.summary(),
