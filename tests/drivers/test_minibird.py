@@ -346,6 +346,10 @@ def test_faults_are_parsed_or_told() -> None:
     assert closure == Faults(pause=Span(2, 1))
     with pytest.raises(ConfigError, match="unknown fault 'dorp'; known: drop"):
         parse(["dorp=1"])
-    for wrong in ("drop=x", "split=1", "pause=a:b", "no-bird=1.5"):
+    for wrong in ("stuck=1:1", "closure:garbage", "closure:mute", "closure:power-cycle=1:1", "closure:no-bird=1"):
+        with pytest.raises(ConfigError, match="cannot have it"):
+            parse([wrong])
+    numbers = ("drop=x", "drop=nan", "flip=-1", "burst=2", "no-bird=1.5", "no-bird=0")
+    for wrong in (*numbers, "split=1", "pause=a:b", "pause=-1:1", "pause=1:0", "unplug=nan:1"):
         with pytest.raises(ConfigError, match="takes"):
             parse([wrong])

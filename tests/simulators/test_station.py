@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from trainer.config import ConfigError
 from trainer.profile import Bird, MinibirdSpec
 from trainer.simulators.faults import Faults
 from trainer.simulators.hands import open_hands
@@ -44,3 +45,10 @@ def test_a_station_without_a_board_sleeps_until_its_next_cycle(tmp_path: Path, m
     station.run(lambda: len(waits) >= 3)
     assert math.fsum(waits) > 0.0
     assert max(waits) <= IDLE_S
+
+
+@pytest.mark.parametrize("missing", [1, 99])
+def test_a_bird_that_cannot_be_missing_is_told(tmp_path: Path, missing: int) -> None:
+    spec = MinibirdSpec(port="x", bird=(Bird(address=1, tool="left"),))
+    with pytest.raises(ConfigError, match=f"no-bird={missing}: one of 1"):
+        Station(spec, None, open_hands("", spec), [tmp_path / "f"], 1.0, Faults(no_bird=missing), Faults(), 0)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from trainer.config import ConfigError
 from trainer.geometry import Rigid
 from trainer.profile import ClosureSpec, MinibirdSpec
 from trainer.simulators.closure_board import BOOT, RATE_HZ, ClosureBoard
@@ -37,11 +38,14 @@ class Station:
         closure_faults: Faults,
         seed: int,
     ) -> None:
+        """Raises ConfigError where the missing bird is none of them, or the only one."""
         self._hands, self._speed, self._faults, self._closure_faults = hands, speed, faults, closure_faults
         self._rng = np.random.default_rng(seed)
         self._birds = {address: k for k, address in enumerate(hands.addresses)}
         self._tools = {bird.address: bird.tool for bird in spec.bird}
         present = [a for a in self._birds if a != faults.no_bird]
+        if not present or faults.no_bird not in (0, *self._birds):
+            raise ConfigError(f"--fault no-bird={faults.no_bird}: one of {len(self._birds)}, and another must be there")
         self._flock = Flock(present, self._pose, SILENCE_S / speed)
         own = [bird.address for bird in spec.bird] if not spec.port else [min(self._birds)]
         self._lines = {
