@@ -75,6 +75,15 @@ def sensor_of(profile: Profile, name: str | None) -> Sensor:
     return sensors[name]
 
 
+def check_anchor(profile: Profile) -> None:
+    """Raises CalibrationError where touched points say nothing of where the instruments are."""
+    if mapping(profile).anchor == "home":
+        raise CalibrationError(
+            f"device '{profile.name}' starts each instrument where its task has it wait, wherever the scene is; "
+            f'set anchor = "none" in [{profile.driver}]'
+        )
+
+
 def calibrate(
     profile: Profile, sensor: Sensor, date: str, points: Readings | None, sweep: Sweep | None, grid: Readings | None
 ) -> Calibration:
@@ -85,11 +94,8 @@ def calibrate(
     spec = mapping(profile)
     if points is None and sweep is None and grid is None:
         raise CalibrationError("nothing was measured; give --points, --sweep or --grid")
-    if points is not None and spec.anchor == "home":
-        raise CalibrationError(
-            f"device '{profile.name}' starts each instrument where its task has it wait, wherever the scene is; "
-            f'set anchor = "none" in [{profile.driver}]'
-        )
+    if points is not None:
+        check_anchor(profile)
     kept = profile.calibration if profile.calibration is not None and grid is None else Calibration(date)
     found = replace(kept, date=date)
     if grid is not None:
