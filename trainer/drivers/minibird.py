@@ -5,7 +5,6 @@ A bird without a fresh sample that is not flawed counts as not seen (:mod:`train
 
 from __future__ import annotations
 
-import math
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack, closing
@@ -118,12 +117,12 @@ class Minibird:
         if reason:
             return reason
         if sample is not instrument.used:
-            turn = np.array(sample.quaternion)
+            position, turn = np.array(sample.position), np.array(sample.quaternion)
             if self._stream.inverse[sample.address]:
                 turn = quaternion_conjugate(turn)
-            pose = self._placer.world_from_tool(k, np.array(sample.position), turn, instrument.bird)
-            if self._closure is not None and self._closure.has(tool) and instrument.used is not None:
-                self._closure.moved(tool, math.dist(sample.position, instrument.used.position), now)
+            pose = self._placer.world_from_tool(k, position, turn, instrument.bird)
+            if self._closure is not None and self._closure.has(tool):
+                self._closure.moved(tool, position, now)
             self._position[k], self._quaternion[k] = pose.position, pose.quaternion
             instrument.used = sample
             self._latency.used(sample.sent_s)

@@ -37,12 +37,6 @@ class Silences:
     drain_s: float = 0.05  # after the stream was stopped
     answer_s: float = 0.5  # for an answer to come
 
-    def faster(self, times: float) -> Silences:
-        """For devices that are simulated faster than real time."""
-        return Silences(
-            self.reset_s / times, self.hold_s / times, self.configure_s / times, self.drain_s, self.answer_s
-        )
-
 
 #: As the units want it.
 UNHURRIED = Silences()
