@@ -95,7 +95,7 @@ def test_a_touch_is_a_mean_of_what_is_held_still() -> None:
 
 
 def test_only_a_live_device_is_looked_at() -> None:
-    with pytest.raises(ConfigError, match="'scripted-expert' receives no records"):
+    with pytest.raises(ConfigError, match="'scripted-expert' cannot be read now, only miniBIRDs can"):
         Watch(load_profile("scripted-expert").profile, 1.0)
 
 

@@ -35,7 +35,7 @@ class Watch:
         """Connects, configures and begins the stream. Raises ConfigError for another driver, DeviceError."""
         spec = profile.minibird
         if profile.driver != "minibird" or spec is None:
-            raise ConfigError(f"device '{profile.name}' receives no records, so there is nothing to look at")
+            raise ConfigError(f"device '{profile.name}' cannot be read now, only miniBIRDs can; give files of readings")
         self._spec = spec
         self._keep_s = keep_s
         self._samples: dict[int, deque[Sample]] = {bird.address: deque() for bird in spec.bird}
