@@ -133,3 +133,9 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
 def test_bounds_hold_their_ends_unless_open(bounds: Bounds, inside: float, outside: float) -> None:
     assert bounds.accepts(inside)
     assert not bounds.accepts(outside)
+
+
+def test_a_mark_of_a_spreadsheet_is_no_text(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    path.write_bytes("\ufefftime_s,größe\n".encode())
+    assert config.read_text(path) == "time_s,größe\n"

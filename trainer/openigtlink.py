@@ -17,7 +17,6 @@ import numpy as np
 
 from trainer.geometry import Array
 
-PORT = 18944  # the protocol's own
 HEADER = struct.Struct(">H12s20sIIQQ")
 CONTENT = struct.Struct(">12f")
 EXTENDED = struct.Struct(">HHII")  # its own length, that of the metadata's header, of the metadata, a number

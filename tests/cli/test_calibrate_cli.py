@@ -10,6 +10,8 @@ import pytest
 
 from tests.conftest import CommandLine
 from tests.drivers.test_calibrate import GRID, PHANTOM, TOML, Readings, recorded, sweep, table, touch
+from trainer.drivers.calibrate import mapping
+from trainer.profile import load_profile
 
 
 @pytest.fixture
@@ -77,3 +79,23 @@ def test_a_profile_that_goes_by_another_calibration_is_told(command_line: Comman
     (station / "mine.toml").write_text(f'calibrated_by = "none"\n{TOML}')
     _, _, err = command_line("devices", "calibrate", station / "mine.toml", "--sweep", station / "sweep.csv")
     assert "the profile goes by 'none', not by this one" in err
+
+
+@pytest.mark.parametrize("device", ["openigtlink", "ndi-aurora"])
+def test_touched_points_calibrate_every_device_that_tells_poses(
+    command_line: CommandLine, station: Path, device: str
+) -> None:
+    """Readings from a file tell where the scene is, and the profile goes by it from then on."""
+    text = load_profile(device).text.replace('anchor = "home"', 'anchor = "none"').replace("scale = 0.1", "scale = 1.0")
+    mine = station / f"{device}.toml"
+    mine.write_text(text)
+    name = mapping(load_profile(device).profile).sensor[0].name
+    turned = station / "sweep.csv"
+    turned.write_text(turned.read_text().replace("Bird", name))
+    files = ("--points", station / "points.csv", "--sweep", turned)
+    code, out, err = command_line("devices", "calibrate", mine, "--sensor", name, *files, "--json")
+    assert code == 0, err
+    found = load_profile(str(mine)).profile
+    placed = found.openigtlink or found.ndi
+    assert placed is not None
+    assert list(placed.position_mm) == json.loads(out)["scene"]["position_mm"]

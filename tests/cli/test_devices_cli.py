@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from trainer import serial_ports
 from trainer.cli.devices import app
+from trainer.config import ConfigError
 from trainer.profile import profile_names
 
 REAL = Path(__file__).parents[3] / "shared/data/tracker/WaterTankBottomTranslationTrackerBuffer.igs.mha"
@@ -140,3 +141,13 @@ def test_check_describes_the_real_recording() -> None:
     assert got["problems"] == []
     assert (got["recording"]["frames"], got["recording"]["gaps"]) == (5000, 614)
     assert list(got["recording"]["sensors"]) == ["Probe", "Reference", "Stylus"]
+
+
+def test_a_simulation_does_not_overwrite_its_profile(tmp_path: Path) -> None:
+    profile = tmp_path / "minibird-pair.toml"
+    profile.write_text((Path(__file__).parents[2] / "devices" / "minibird-pair.toml").read_text())
+    before = profile.read_text()
+    got = runner.invoke(app, ["simulate", str(profile), "--out", str(tmp_path)])
+    assert isinstance(got.exception, ConfigError)
+    assert "is the profile itself; give --out another folder" in str(got.exception)
+    assert profile.read_text() == before

@@ -8,6 +8,8 @@ import os
 import signal
 import threading
 import tomllib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +17,12 @@ import pytest
 from conftest import CommandLine
 from simulated_devices import SHORT, simulated
 
+from trainer import session
 from trainer.cli import calibrate
+from trainer.drivers import calibrate as fits
 from trainer.drivers import watch
 from trainer.geometry import Array, Rigid, quaternion_from_euler_deg
+from trainer.session import interruptible
 
 TIP = np.array([2.0, -1.0, 90.0])  # mm, sensor_from_tool
 PIVOT = np.array([250.0, 20.0, 30.0])  # mm, in the transmitter's frame, well inside the forward hemisphere
@@ -29,7 +34,9 @@ def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(watch, "UNHURRIED", SHORT)
 
 
-def test_a_device_in_the_hand_is_monitored(command_line: CommandLine, tmp_path: Path) -> None:
+def test_a_device_in_the_hand_is_monitored(
+    command_line: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """As one document, and as a table where stdout is no terminal; Ctrl-C ends one without ``--seconds``."""
     with simulated(tmp_path) as profile:
         code, out, err = command_line("devices", "monitor", profile, "--seconds", "0.5", "--json")
@@ -39,10 +46,19 @@ def test_a_device_in_the_hand_is_monitored(command_line: CommandLine, tmp_path: 
         assert got["records"] > 50
         assert got["flaws"]["good"] >= got["records"]
         assert got["sensors"]["bird1"]["tool"] == "right"
-        timer = threading.Timer(2.5, os.kill, (os.getpid(), signal.SIGINT))
-        timer.start()
+        begun = interruptible
+
+        @contextmanager
+        def interrupted() -> Iterator[Callable[[], bool]]:
+            """Ctrl-C half a second after the device was connected, when it is no longer an error."""
+            with begun() as asked:
+                timer = threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT))
+                timer.start()
+                yield asked
+                timer.join()
+
+        monkeypatch.setattr(session, "interruptible", interrupted)
         code, out, _ = command_line("devices", "monitor", profile)
-        timer.join()
         assert code == 0
         for text in ("minibird-pair", "bird2 (left)", "Hz", "not calibrated"):
             assert text in out
@@ -114,8 +130,20 @@ def test_points_are_touched_one_after_the_other(
         found = json.loads(out)["scene"]
         np.testing.assert_allclose(found["position_mm"], [-300.0, 5.0, 7.0], rtol=0, atol=1e-6)
         assert found["residual_mm"] < 1e-6
+        (kept,) = (tmp_path / "out").glob("*.readings-*-points.csv")
+        read = fits.read_readings(kept)
+        np.testing.assert_array_equal(read.position, device)
+        np.testing.assert_array_equal(read.known, places)
+        kept.unlink()
         monkeypatch.setattr("sys.stdin", io.StringIO("\n"))
         code, out, err = command_line("devices", "calibrate", profile, "--sensor", "bird2", "--points", table)
         assert code == 1
-        assert "the input ended before all was measured; nothing is kept" in err
+        assert "the input ended before all was measured; no calibration is made" in err
+        (kept,) = (tmp_path / "out").glob("*.readings-*-points.csv")
+        assert len(fits.read_readings(kept).position) == 1
+        profile.write_text(text.replace('anchor = "none"', 'anchor = "home"'))
+        before = len(asked)
+        code, out, err = command_line("devices", "calibrate", profile, "--sensor", "bird2", "--points", table)
+        assert (code, len(asked)) == (1, before)
+        assert 'set anchor = "none" in [minibird]' in err
     assert len(list((tmp_path / "out").glob("*.calibration-*.toml"))) == 1

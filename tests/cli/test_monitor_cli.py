@@ -64,6 +64,7 @@ def test_the_age_of_the_calibration_is_told(command_line: CommandLine, table: Pa
     ("reference", "complaint"),
     [
         ("scripted-expert", "device 'scripted-expert' receives no records, so there is nothing to monitor"),
+        ("openigtlink", "device 'openigtlink' cannot be monitored: only miniBIRDs and recordings can"),
         ("none.csv", "none.csv: no such file"),
         ("x.db#1", "receives no records"),
         ("plus-sequence", "give its path to --device, or 'recording.path'"),

@@ -9,7 +9,7 @@ import signal
 import sqlite3
 import threading
 import time
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,9 +18,14 @@ import pytest
 from conftest import CommandLine
 from simulated_devices import SHORT, simulated
 
-from trainer import curriculum
+from trainer import clock, curriculum, drivers
+from trainer.cli.main import main
+from trainer.clock import Realtime
+from trainer.curriculum import Task
 from trainer.drivers.minibird import Minibird
 from trainer.drivers.minibird_flock import UNHURRIED
+from trainer.poses import ToolPoses
+from trainer.profile import ProfileFile, load_profile
 
 
 @pytest.fixture(autouse=True)
@@ -140,7 +145,59 @@ def test_a_device_that_is_not_there_is_one_line_and_no_session(
         1,
         f"trainer: {tmp_path / 'ttyACM0'}: no such port; plug the device in, or give the profile its port\n",
     )
-    assert command_line("sessions", "list")[1].strip() == "" or "ttyACM0" not in command_line("sessions", "list")[1]
+    assert json.loads(command_line("sessions", "list", "--json")[1]) == []
+
+
+class Talkative:
+    """A device in a hand that a library's thread opens again and again, and prints; it ends after 20 ticks."""
+
+    def __init__(self, home: ToolPoses) -> None:
+        self._home, self._stop = home, threading.Event()
+        self._thread = threading.Thread(target=self._talk)
+        self._thread.start()
+
+    def _talk(self) -> None:
+        while not self._stop.wait(0.001):
+            print("a tracker found")
+            os.write(1, b"1 packets transmitted")
+
+    def poll(self, tick: int, view: object) -> ToolPoses | None:
+        return self._home if tick < 20 else None
+
+    def tick(self, record: object) -> None:
+        """It measures no latency."""
+
+    def summary(self) -> dict[str, object]:
+        return {}
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join()
+
+
+def test_stdout_is_the_document_s_alone_and_a_hand_keeps_its_pace(
+    task: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Whatever a device's library prints until the end, by child processes too. ``--fast`` does not hurry a hand: its
+    clock waits for each tick, so that the waiting is no work."""
+    made: list[Realtime] = []
+
+    class Noted(Realtime):
+        def __init__(self, tick_hz: float) -> None:
+            super().__init__(tick_hz)
+            made.append(self)
+
+    def opened(reference: str, task: Task, home: ToolPoses, seed: int) -> tuple[ProfileFile, Talkative]:
+        return load_profile("scripted-expert"), Talkative(home)
+
+    monkeypatch.setattr(drivers, "open_driver", opened)
+    monkeypatch.setattr(clock, "Realtime", Noted)
+    monkeypatch.setattr("sys.argv", ["trainer", "practice", str(task), "--fast", "--no-record", "--json"])
+    with suppress(SystemExit):
+        main()
+    result = json.loads(capfd.readouterr().out)
+    assert result["reason"].startswith("the input ended")
+    assert [len(c.work_ms) for c in made] == [21]
 
 
 def test_only_a_device_with_a_line_can_be_simulated(command_line: CommandLine, tmp_path: Path) -> None:

@@ -79,3 +79,14 @@ def test_a_pause_begins_a_new_line() -> None:
     later = 1.0098 + (BREAK + 2) * 0.0102
     assert line.observe(later) == later
     assert line.period_s == 0.01
+
+
+@pytest.mark.parametrize("hz", [51.5, 80.0, 103.0, 140.0])
+def test_the_rate_is_that_of_the_samples_whatever_was_asked_for(hz: float) -> None:
+    """Even samples have no jitter, to the rounding above, and none is told of a line that is not theirs."""
+    line = ClockLine(1 / 103)
+    for k in range(2000):
+        line.observe(k / hz)
+    line.observe(2000 / hz + 5.0)  # a pause is none of its intervals
+    assert line.rate_hz == pytest.approx(hz, rel=1e-9)
+    assert line.jitter_s == (pytest.approx(0.0, abs=1e-9) if hz == 103.0 else None)

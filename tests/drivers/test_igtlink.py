@@ -55,10 +55,12 @@ def publishing(port: int = 0, poses: ToolPoses = POSES) -> Iterator[int]:
 
     thread = threading.Thread(target=ticks)
     thread.start()
-    yield sink.port
-    ended.set()
-    thread.join()
-    sink.close()
+    try:
+        yield sink.port
+    finally:
+        ended.set()
+        thread.join()
+        sink.close()
 
 
 def opened(port: int, spec: OpenigtlinkSpec | None = None) -> LivePoses:

@@ -12,8 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trainer.drivers import minibird_commands as commands
+from trainer.drivers import minibird_flock
 from trainer.drivers.minibird_record import POSITION_MM, decode
 from trainer.geometry import Rigid, quaternion_from_axis_angle, quaternion_from_euler_deg
+from trainer.profile import Bird, MinibirdSpec
 from trainer.simulators.flock import ARGUMENTS, CHANGEABLE, DEFAULTS, Flock
 
 POSE = Rigid(np.array([100.0, -20.0, 3.0]), quaternion_from_euler_deg((10.0, 20.0, 30.0)))
@@ -174,3 +176,58 @@ def test_a_quaternion_s_words_turn_by_less_than_a_hundredth_of_a_degree_and_a_ha
         q /= np.linalg.norm(q)
         cross = np.linalg.norm(np.outer(q, pose.quaternion) - np.outer(pose.quaternion, q)) / math.sqrt(2)
         assert math.degrees(2 * math.asin(min(1.0, cross))) <= 0.0141
+
+
+class Port:
+    """The port of a simulated flock's first unit; bytes go over it at once."""
+
+    def __init__(self, flock: Flock) -> None:
+        self._flock = flock
+        self._waiting = b""
+
+    def write(self, data: bytes) -> None:
+        self._waiting += self._flock.receive(1, data, time.monotonic())
+
+    def read(self, count: int) -> bytes:
+        out, self._waiting = self._waiting[:count], self._waiting[count:]
+        return out
+
+    @property
+    def in_waiting(self) -> int:
+        return len(self._waiting)
+
+    def close(self) -> None:
+        """Nothing stays open."""
+
+
+def connected(f: Flock, monkeypatch: pytest.MonkeyPatch, *addresses: int) -> minibird_flock.Flock:
+    """A conversation with a flock whose silences are short, for a profile with birds of these addresses."""
+    f._silence_s = 0.001
+    monkeypatch.setattr(minibird_flock, "open_port", lambda url, baud: Port(f))
+    birds = tuple(Bird(address=a, tool=t) for a, t in zip(addresses, ("left", "right"), strict=False))
+    silences = minibird_flock.Silences(0.0, 0.0, 0.01, 0.001, 0.2)
+    found = minibird_flock.Flock(MinibirdSpec(port="x", bird=birds), silences)
+    found.connect()
+    return found
+
+
+@pytest.mark.parametrize("addresses", [(2,), (2, 3)])
+def test_the_unit_at_the_port_speaks_for_all_also_where_it_moves_nothing(
+    monkeypatch: pytest.MonkeyPatch, addresses: tuple[int, ...]
+) -> None:
+    f = flock(*range(1, addresses[-1] + 1))
+    [(_, parser)] = connected(f, monkeypatch, *addresses).begin().values()
+    found = [s for _ in range(3) for s in parser.feed(b"".join(f.cycle().values()), 0.0)]
+    assert [s.address for s in found] == 3 * list(range(1, addresses[-1] + 1))
+    assert f.rate_hz == MinibirdSpec(port="x", bird=(Bird(address=1, tool="left"),)).rate_hz
+
+
+def test_what_an_earlier_program_left_is_undone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every eighth cycle only, and bytes of the buttons and of the field's distortion behind each record."""
+    f = configured()
+    for prefix in (b"", b"\xf2"):
+        f.receive(1, b"".join(prefix + command for command in (b"S", b"M\x01", b"s\x01\x00")), 2.0)
+    assert len(f.receive(1, b"]B", 2.0)) == 16
+    [(_, parser)] = connected(f, monkeypatch, 1, 2).begin().values()
+    found = [s for _ in range(5) for s in parser.feed(b"".join(f.cycle().values()), 0.0)]
+    assert [(s.address, s.flaw) for s in found] == 5 * [(1, ""), (2, "")]

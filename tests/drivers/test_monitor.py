@@ -23,7 +23,7 @@ def test_a_steady_stream_has_its_rate_and_neither_jitter_nor_loss() -> None:
 def test_what_is_lost_is_counted_either_way_and_is_no_jitter(keep: set[int], late: float) -> None:
     """200 records sent at 100 Hz, each second one late by up to two fifths of a period, some lost.
 
-    The device's own count and the rounding of intervals, each off by less than half a period, must agree.
+    The device's own count and what is missing of the rate, off by less than half a period, must agree.
     """
     sent = np.arange(200)
     time = (sent + late * (sent % 2)) / 100
@@ -42,6 +42,17 @@ def test_jitter_is_the_standard_deviation_of_the_intervals() -> None:
     assert arrival(time, nominal_hz=100.0).jitter_ms == pytest.approx(2.0, rel=0.02)
     assert arrival(time).interval_max_ms == pytest.approx(12.0)
     assert (arrival(time).lost, arrival(time).loss_percent) == (None, None)
+
+
+def test_silence_at_the_ends_is_lost_and_slows_the_rate() -> None:
+    """100 records at 100 Hz, listened to from 1 s before the first to 8 s after the last: 900 of 1000 lost, to one."""
+    found = arrival(5.0 + np.arange(100) / 100, nominal_hz=100.0, span=(4.0, 13.99))
+    assert found.lost == pytest.approx(900, abs=1)
+    assert found.loss_percent == pytest.approx(90.0, abs=0.1)
+    assert found.rate_hz == pytest.approx(10.0, abs=0.1)
+    nothing = arrival(np.zeros(0), nominal_hz=100.0, span=(4.0, 5.0))
+    assert (nothing.lost, nothing.loss_percent) == (pytest.approx(100, abs=1), 100.0)
+    assert seen(np.zeros((100, 3)), np.ones(100, dtype=bool), None, lost=900).seen_percent == 10.0
 
 
 @pytest.mark.parametrize("n", [0, 1])

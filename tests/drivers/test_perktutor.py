@@ -83,3 +83,11 @@ def test_a_bad_log_is_one_line(tmp_path: Path, old: bytes, new: bytes, complaint
     assert changed != content
     with pytest.raises(ConfigError, match=complaint):
         perktutor.read(put(tmp_path, ".xml", changed))
+
+
+@pytest.mark.parametrize("encoding", ["foo", "gb2312"])
+def test_an_encoding_that_cannot_be_read_is_one_line(tmp_path: Path, encoding: str) -> None:
+    path = tmp_path / "log.xml"
+    path.write_text(f'<?xml version="1.0" encoding="{encoding}"?>\n<TransformRecorderLog/>\n')
+    with pytest.raises(ConfigError, match=r"log.xml: its encoding cannot be read: .*; save it as UTF-8"):
+        perktutor.read(path)

@@ -318,3 +318,9 @@ def test_the_real_recording_is_played_whole(task: Task, home: ToolPoses) -> None
     right = [i.tool for i in task.scene.instrument].index("right")
     ours = np.linalg.norm(np.diff(position[:, right], axis=0), axis=1).sum()
     assert ours == pytest.approx(length, rel=0.01)
+
+
+@pytest.mark.parametrize("last", [90_000.0, 3e14, 1e300])
+def test_times_that_are_no_seconds_are_one_line(last: float) -> None:
+    with pytest.raises(ConfigError, match=r"lasts .* s; are its times in seconds\?"):
+        recording.tick_times(sequence(np.array([0.0, last])), 100.0)

@@ -139,7 +139,7 @@ def library(monkeypatch: pytest.MonkeyPatch) -> Any:
     return found
 
 
-def test_the_cap_moves_its_instrument_and_no_other(library: Any, capfd: pytest.CaptureFixture[str]) -> None:
+def test_the_cap_moves_its_instrument_and_no_other(library: Any) -> None:
     driver = open_spacemouse(SPEC, None, TOOLS, TICK_HZ, HOME)
     polling = Polling(driver)
     library.mice[0].state.x = 1.0
@@ -152,7 +152,6 @@ def test_the_cap_moves_its_instrument_and_no_other(library: Any, capfd: pytest.C
     driver.close()
     assert library.mice[0].closed
     assert library.asked == [(None, AxisConvention.HID_Z_UP, True)]
-    assert capfd.readouterr().out == ""
 
 
 def test_a_mouse_pulled_out_freezes_its_instrument_which_goes_on_from_there(library: Any) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +13,7 @@ from simulated_devices import SHORT, loaded, simulated
 from trainer.calibration import CalibrationError
 from trainer.config import ConfigError
 from trainer.drivers import watch
+from trainer.drivers.minibird_flock import UNHURRIED
 from trainer.drivers.serial_port import DeviceError
 from trainer.drivers.watch import STILL_MM, Watch
 from trainer.geometry import Array
@@ -51,6 +54,25 @@ def test_what_is_silent_says_why(tmp_path: Path) -> None:
         assert device.seen()["bird1"][1].position_mm is None
 
 
+def test_a_silent_device_forgets_what_it_was_and_counts_what_it_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At real speed: 0.5 s of 103 Hz, then 0.7 s of silence within the second that is kept: 72 lost, and a bird that
+    is seen 30 % of the time. A busy machine and the beginning may make it a tenth of a second more or less."""
+    monkeypatch.setattr(watch, "UNHURRIED", replace(SHORT, configure_s=UNHURRIED.configure_s))
+    with simulated(tmp_path, "--fault", "pause=0.5:3", speed=1.0) as path, Watch(loaded(path), keep_s=1.0) as device:
+        ends = time.monotonic() + 30.0
+        while len(device.samples(1)) < 40 and time.monotonic() < ends:
+            time.sleep(0.01)
+        while time.monotonic() - device.samples(1)[-1].arrived_s < 0.7:
+            time.sleep(0.01)
+        arrived, seen = device.arrival(), device.seen()
+    assert arrived.duration_s == pytest.approx(1.0, abs=0.1)
+    assert arrived.lost == pytest.approx(72, abs=12)
+    assert arrived.rate_hz == pytest.approx(31.0, abs=12.0)
+    assert seen["bird1"][1].seen_percent == pytest.approx(30.0, abs=12.0)
+
+
 def still(strayed_mm: float) -> Watch:
     """A device of which a sensor said 20 times the same, but once something else by so much."""
     position: Array = np.zeros((20, 3))
@@ -73,7 +95,7 @@ def test_a_touch_is_a_mean_of_what_is_held_still() -> None:
 
 
 def test_only_a_live_device_is_looked_at() -> None:
-    with pytest.raises(ConfigError, match="'scripted-expert' receives no records"):
+    with pytest.raises(ConfigError, match="'scripted-expert' cannot be read now, only miniBIRDs can"):
         Watch(load_profile("scripted-expert").profile, 1.0)
 
 

@@ -130,3 +130,13 @@ def test_a_client_of_pyigtl_hears_the_poses(sink: IgtlinkSink) -> None:
         assert peer.stdout is not None
         matrix = [[1.0, 0, 0, 0], [0, 1.0, 0, 2.5], [0, 0, 1.0, 0], [0, 0, 0, 1.0]]
         assert peer.stdout.read().replace(".0", "") == f"TRANSFORM {matrix}\n".replace(".0", "")
+
+
+@pytest.mark.parametrize("host", ["nowhere.invalid", "192.0.2.1"])
+def test_a_host_that_is_not_this_machine_is_named(host: str) -> None:
+    """192.0.2.0/24 is kept for documentation (RFC 5737), ``.invalid`` for names that are none (RFC 6761)."""
+    with pytest.raises(
+        PublishError, match=rf"^{host}:0: .*; give 'host' in \[publish\] an address of this machine$"
+    ) as told:
+        IgtlinkSink(host, 0, ("left",))
+    assert "Unknown error" not in str(told.value)

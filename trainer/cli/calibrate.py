@@ -31,7 +31,10 @@ def calibrate(
 
     profile = load_profile(reference).profile
     chosen = fits.sensor_of(profile, sensor)
-    measured = _measured(profile, chosen, points, sweep, grid)
+    if points is not None:
+        fits.check_anchor(profile)  # before anybody has touched anything
+    keep = profile_path(reference).with_suffix(f".readings-{datetime.now(UTC):%Y-%m-%dT%H%M%SZ}")
+    measured = _measured(profile, chosen, points, sweep, grid, keep)
     found = fits.calibrate(profile, chosen, datetime.now(UTC).isoformat(timespec="seconds"), *measured)
     path = calibration.path_for(profile_path(reference), found)
     calibration.write(path, found)
@@ -56,9 +59,12 @@ def calibrate(
 
 
 def _measured(
-    profile: Profile, sensor: Sensor, points: Path | None, sweep: Path | None, grid: Path | None
+    profile: Profile, sensor: Sensor, points: Path | None, sweep: Path | None, grid: Path | None, keep: Path
 ) -> tuple[Readings | None, Sweep | None, Readings | None]:
-    """Readings at points, a sweep, and readings on a grid: from their files, or taken now from the device."""
+    """Readings at points, a sweep, and readings on a grid: from their files, or taken now from the device.
+
+    Those that are taken now are written to ``keep`` with ``-points.csv`` and ``-grid.csv`` at its end.
+    """
     from contextlib import ExitStack
 
     from trainer.drivers import calibrate as fits
@@ -71,24 +77,39 @@ def _measured(
             device = stack.enter_context(Watch(profile, SWEEP_S))
         place = None
         if grid is not None:
-            place = fits.read_readings(grid) if to_take is None else _touched(device, sensor, to_take)
+            place = (
+                fits.read_readings(grid)
+                if to_take is None
+                else _touched(device, sensor, to_take, Path(f"{keep}-grid.csv"))
+            )
         turned = None
         if sweep is not None:
             turned = fits.read_sweep(sweep, sensor.name) if sweep != LIVE else _swept(device, sensor)
         touched = None
         if points is not None:
-            touched = fits.read_readings(points) if to_touch is None else _touched(device, sensor, to_touch)
+            touched = (
+                fits.read_readings(points)
+                if to_touch is None
+                else _touched(device, sensor, to_touch, Path(f"{keep}-points.csv"))
+            )
     return touched, turned, place
 
 
-def _touched(device: Watch | None, sensor: Sensor, places: Array) -> Readings:
-    """The device's readings at each of ``places`` (n, 3) mm, one after the other, as somebody gets there."""
+def _touched(device: Watch | None, sensor: Sensor, places: Array, keep: Path) -> Readings:
+    """The device's readings at each of ``places`` (n, 3) mm, one after the other, as somebody gets there.
+
+    Each is written to ``keep`` at once, which ``--points`` or ``--grid`` reads again: a refusal later loses nothing.
+    """
     import numpy as np
 
     from trainer.calibration import CalibrationError
-    from trainer.drivers.calibrate import Readings
+    from trainer.drivers.calibrate import KNOWN, READING, Readings
+    from trainer.drivers.pose_table import QUATERNION
 
     assert device is not None
+    with keep.open("x", encoding="utf-8", newline="\n") as file:
+        file.write(",".join((*READING, *QUATERNION, *KNOWN)) + "\n")
+    typer.echo(f"trainer: readings are kept in {keep}", err=True)
     position: list[Array] = []
     quaternion: list[Array] = []
     for k, place in enumerate(places.tolist(), 1):
@@ -102,6 +123,8 @@ def _touched(device: Watch | None, sensor: Sensor, places: Array) -> Readings:
                 continue
             position.append(p)
             quaternion.append(q)
+            with keep.open("a", encoding="utf-8", newline="\n") as file:
+                file.write(",".join(repr(float(v)) for v in (*p, *q, *place)) + "\n")
     return Readings(np.array(position), np.array(quaternion), places)
 
 
@@ -119,4 +142,4 @@ def _wait_for(what: str) -> None:
 
     typer.echo(what, err=True)
     if not sys.stdin.readline():
-        raise CalibrationError("the input ended before all was measured; nothing is kept")
+        raise CalibrationError("the input ended before all was measured; no calibration is made")

@@ -95,8 +95,10 @@ def simulate(
     out.mkdir(parents=True, exist_ok=True)
     ports = [out / "flock"] if spec.port else [out / f"bird{bird.address}" for bird in spec.bird]
     ports += [out / "closure"] if closure is not None else []
-    station = Station(spec, closure, hands, ports, speed, trackers, closures, seed)
     written = out / f"{file.profile.name}.toml"
+    if written.exists() and file.path.endswith(".toml") and written.samefile(file.path):
+        raise ConfigError(f"{written}: is the profile itself; give --out another folder")
+    station = Station(spec, closure, hands, ports, speed, trackers, closures, seed)
     written.write_text(with_ports(file.text, ports, hands.in_scene), encoding="utf-8")
     ended = False
 

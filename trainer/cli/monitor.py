@@ -35,6 +35,8 @@ def show(reference: str, seconds: float | None, as_json: bool) -> None:
     if profile.driver == "minibird":
         _watch(profile, seconds, as_json)
         return
+    if profile.driver in ("openigtlink", "ndi", "spacemouse"):
+        raise ConfigError(f"device '{profile.name}' cannot be monitored: only miniBIRDs and recordings can")
     if spec is None or profile.driver != "recording" or drivers.is_logged(drivers.recording_path(file)):
         raise ConfigError(f"device '{profile.name}' receives no records, so there is nothing to monitor")
     motion = read(drivers.recording_path(file))

@@ -31,7 +31,12 @@ def practice(
     anatomy: Annotated[
         str, typer.Option(metavar="PATH", help="Another knee than the task's: a folder of `anatomy import`, or a name.")
     ] = "",
-    realtime: Annotated[bool, typer.Option("--realtime/--fast", help="At the task's pace, or without pauses.")] = True,
+    realtime: Annotated[
+        bool,
+        typer.Option(
+            "--realtime/--fast", help="At the task's pace, as always with a device in the hand, or without pauses."
+        ),
+    ] = True,
     record: Annotated[
         Path | None, typer.Option(metavar="PATH.rrd", help="The recording; by default in recordings/ beside the log.")
     ] = None,
@@ -95,8 +100,10 @@ def perform(
     from trainer.choice import choose_tissue, region_method, thread_method
     from trainer.cli.progress import Progress
     from trainer.cli.warmup import announce, warm_up
+    from trainer.clock import Realtime
     from trainer.drivers import open_driver
     from trainer.drivers.driver import LiveDriver
+    from trainer.drivers.makers import stdout_kept
     from trainer.log.record import ANATOMY, ANATOMY_SHA256, TOLERANCE
     from trainer.metrics.registry import check_targets, score
     from trainer.reporting.wording import out_of_sight
@@ -115,8 +122,12 @@ def perform(
     _close_interrupted(log_path)
     announce()
     scene = build(task, anatomy=knee) if tissue is None else build(task, tissue.tolerance_mN)
+    session = stack.enter_context(ExitStack())
+    session.enter_context(stdout_kept())  # a device's library may print whenever it opens it again
     profile, driver = open_driver(device, task, scene.home, seed)
-    stack.enter_context(closing(driver))
+    session.enter_context(closing(driver))
+    if isinstance(driver, LiveDriver) and not clock.realtime:
+        clock = Realtime(task.tick_hz)  # a hand has its own pace; waiting for it is no work of a tick
     if clock.realtime:
         warm_up(task, knee)
     header = _header(session_id, trainee, task_file, profile, seed, scene.tools, recording_path)
@@ -145,6 +156,7 @@ def perform(
         recording.metrics(metrics)
     pace, seen = clock.report(), driver.summary()
     log.finish(scene.outcome, scene.reason, scene.tick, duration_s, pace, seen, metrics)
+    session.close()
     return {
         "session": session_id,
         "task": task_file.path,

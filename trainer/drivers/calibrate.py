@@ -9,8 +9,10 @@ The readings come from files, or from a live device (:mod:`trainer.drivers.watch
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -20,7 +22,7 @@ from trainer.drivers import field_distortion, motion_file, pivot, pose_table, to
 from trainer.drivers.plausible import unit_quaternions
 from trainer.drivers.recording import map_poses
 from trainer.geometry import Array
-from trainer.profile import Profile, RecordingSpec, Sensor
+from trainer.profile import Mount, Profile, RecordingSpec, Registration, Sensor
 
 #: Columns of a table of readings at known places; the sensor's orientation may stand beside them (qw qx qy qz).
 READING = pose_table.POSITION
@@ -46,21 +48,30 @@ class Sweep:
 
 def mapping(profile: Profile) -> RecordingSpec:
     """How a profile maps its sensors, of which those of a flock are called bird1, bird2 … Raises ConfigError."""
-    flock = profile.minibird
+    flock, server, tracker = profile.minibird, profile.openigtlink, profile.ndi
     if profile.driver == "recording" and profile.recording is not None and profile.recording.sensor:
         return profile.recording
-    if profile.driver != "minibird" or flock is None:
-        raise ConfigError(f"device '{profile.name}' has no sensors to calibrate")
-    sensors = [
-        Sensor(f"bird{b.address}", b.tool, position_mm=b.position_mm, rotation_deg=b.rotation_deg) for b in flock.bird
-    ]
+    if profile.driver == "minibird" and flock is not None:
+        return _mapping(flock, {f"bird{bird.address}": (bird.tool, bird) for bird in flock.bird})
+    if profile.driver == "openigtlink" and server is not None:
+        return _mapping(server, {device.name: (device.tool, device) for device in server.device})
+    if profile.driver == "ndi" and tracker is not None:
+        return _mapping(tracker, {sensor.name: (sensor.tool, sensor) for sensor in tracker.sensor})
+    raise ConfigError(f"device '{profile.name}' has no sensors to calibrate")
+
+
+def _mapping(spec: Registration, sensors: Mapping[str, tuple[Literal["left", "right"], Mount]]) -> RecordingSpec:
+    """The registration of a device in the hand, with each sensor's instrument and place on it."""
     return RecordingSpec(
-        sensor=tuple(sensors),
-        scale=flock.scale,
-        position_mm=flock.position_mm,
-        rotation_deg=flock.rotation_deg,
-        anchor=flock.anchor,
-        distortion=flock.distortion,
+        sensor=tuple(
+            Sensor(name, tool, position_mm=mount.position_mm, rotation_deg=mount.rotation_deg)
+            for name, (tool, mount) in sensors.items()
+        ),
+        scale=spec.scale,
+        position_mm=spec.position_mm,
+        rotation_deg=spec.rotation_deg,
+        anchor=spec.anchor,
+        distortion=spec.distortion,
     )
 
 
@@ -75,6 +86,15 @@ def sensor_of(profile: Profile, name: str | None) -> Sensor:
     return sensors[name]
 
 
+def check_anchor(profile: Profile) -> None:
+    """Raises CalibrationError where touched points say nothing of where the instruments are."""
+    if mapping(profile).anchor == "home":
+        raise CalibrationError(
+            f"device '{profile.name}' starts each instrument where its task has it wait, wherever the scene is; "
+            f'set anchor = "none" in [{profile.driver}]'
+        )
+
+
 def calibrate(
     profile: Profile, sensor: Sensor, date: str, points: Readings | None, sweep: Sweep | None, grid: Readings | None
 ) -> Calibration:
@@ -85,11 +105,8 @@ def calibrate(
     spec = mapping(profile)
     if points is None and sweep is None and grid is None:
         raise CalibrationError("nothing was measured; give --points, --sweep or --grid")
-    if points is not None and spec.anchor == "home":
-        raise CalibrationError(
-            f"device '{profile.name}' starts each instrument where its task has it wait, wherever the scene is; "
-            f'set anchor = "none" in [{profile.driver}]'
-        )
+    if points is not None:
+        check_anchor(profile)
     kept = profile.calibration if profile.calibration is not None and grid is None else Calibration(date)
     found = replace(kept, date=date)
     if grid is not None:

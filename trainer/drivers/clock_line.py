@@ -33,6 +33,8 @@ class ClockLine:
         self._nominal_s = period_s
         self._residual2 = 0.0  # s², sum over all samples of the session
         self._count = 0
+        self._intervals = 0  # between samples of one line, and how long they took together
+        self._lasted_s = 0.0
         self._mark = (0, 0.0, 0)  # the newest sample's number on its line, when it was due, the number of the line
         self._begin(0.0)
 
@@ -58,6 +60,8 @@ class ClockLine:
             steps = 1 + self._lost(arrived_s)
             number, line = self._mark[0] + steps, self._mark[2]
             self._shift(steps, arrived_s - self._newest_s)
+            self._intervals += 1
+            self._lasted_s += arrived_s - self._newest_s
         self._seen += 1
         self._n += 1.0
         self._newest_s = arrived_s
@@ -95,6 +99,16 @@ class ClockLine:
         self._it = it - steps * t - seconds * i + n * steps * seconds
 
     @property
-    def jitter_s(self) -> float:
-        """Root mean square of arrival against the line, over all samples so far."""
-        return math.sqrt(self._residual2 / self._count) if self._count else 0.0
+    def jitter_s(self) -> float | None:
+        """Root mean square of arrival against the line, over all samples so far.
+
+        None where they came at another rate than the one that was asked for: the line is not theirs.
+        """
+        if abs(self.rate_hz * self._nominal_s - 1.0) > TRUE_TO:
+            return None
+        return math.sqrt(self._residual2 / self._count)
+
+    @property
+    def rate_hz(self) -> float:
+        """Samples that arrived by time, pauses left out; 0 before there are two."""
+        return self._intervals / self._lasted_s if self._lasted_s > 0.0 else 0.0

@@ -6,8 +6,11 @@ import threading
 import time
 from typing import Any
 
+import numpy as np
+
 from trainer.drivers.closure_line import Counts, LineParser
 from trainer.drivers.serial_port import DeviceError, open_port, read_some
+from trainer.geometry import Array
 from trainer.profile import ClosureSpec, Jaw
 
 #: Opening the port restarts the board; its first line comes after its boot loader, and no later than this, s.
@@ -63,10 +66,10 @@ class ClosureSensor:
             return 0.0, OUT_OF_RANGE
         return min(1.0, max(0.0, share)), ""
 
-    def moved(self, tool: str, way_mm: float, now_s: float) -> None:
-        """The instrument moved by ``way_mm``: a sensor that does not notice for long is stuck."""
+    def moved(self, tool: str, position: Array, now_s: float) -> None:
+        """The instrument's sensor is at ``position`` (3,) mm: jaws that do not notice that it moves are stuck."""
         if self._newest is not None:
-            self._jaws[tool].moved(_raw(self._newest, tool), way_mm, now_s)
+            self._jaws[tool].moved(_raw(self._newest, tool), position, now_s)
 
     def summary(self) -> dict[str, object]:
         return {
@@ -120,12 +123,13 @@ class _Watch:
         self._raw = -1
         self._since_s = 0.0
         self._seen_s = 0.0
-        self._way_mm = 0.0
+        self._from: Array = np.zeros(3)  # where the forceps were when the count last changed, …
+        self._farthest_mm = 0.0  # … and how far from there they have been: a path's length would be a tracker's noise
 
-    def moved(self, raw: int, way_mm: float, now_s: float) -> None:
+    def moved(self, raw: int, position: Array, now_s: float) -> None:
         if raw != self._raw or now_s - self._seen_s > STUCK_S:  # after a longer loss the account begins anew
-            self._raw, self._since_s, self._way_mm = raw, now_s, 0.0
-        elif now_s - self._since_s >= STUCK_S and self._way_mm >= STUCK_MM:
+            self._raw, self._since_s, self._from, self._farthest_mm = raw, now_s, position, 0.0
+        elif now_s - self._since_s >= STUCK_S and self._farthest_mm >= STUCK_MM:
             self.stuck_s += now_s - self._seen_s
-        self._way_mm += way_mm
+        self._farthest_mm = max(self._farthest_mm, float(np.linalg.norm(position - self._from)))
         self._seen_s = now_s

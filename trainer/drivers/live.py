@@ -113,7 +113,7 @@ class LivePoses:
                     self._trouble = ""
                 for reading in connection.read():
                     self._take(reading)
-            except DeviceError as error:
+            except (DeviceError, ConfigError) as error:  # a file that the profile names may be gone as well
                 self._trouble = str(error)
                 if connection is not None:
                     connection.close()
@@ -153,11 +153,10 @@ class LivePoses:
             jaws, reason = measured.closure(sensor.tool, now)
         if reason:
             return reason
-        used = self._used.get(sensor.name)
-        if reading is not used:
+        if reading is not self._used.get(sensor.name):
             pose = self._placer.world_from_tool(k, reading.position, reading.quaternion, sensor)
-            if measured is not None and used is not None:
-                measured.moved(sensor.tool, float(np.linalg.norm(reading.position - used.position)), now)
+            if measured is not None:
+                measured.moved(sensor.tool, reading.position, now)
             self._position[k], self._quaternion[k] = pose.position, pose.quaternion
             self._used[sensor.name] = reading
             self._latency.used(reading.arrived_s)

@@ -35,7 +35,10 @@ def failures(device: str) -> Iterator[None]:
 
 @contextmanager
 def stdout_kept() -> Iterator[None]:
-    """What is printed inside, by child processes too, goes to stderr: stdout is for the program's own answers."""
+    """What is printed inside, by child processes too, goes to stderr: stdout is for the program's own answers.
+
+    For the whole process, so only the thread that prints the answers may use it, around all that others do meanwhile.
+    """
     sys.stdout.flush()
     kept = os.dup(1)
     os.dup2(2, 1)

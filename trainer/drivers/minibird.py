@@ -5,7 +5,6 @@ A bird without a fresh sample that is not flawed counts as not seen (:mod:`train
 
 from __future__ import annotations
 
-import math
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack, closing
@@ -118,12 +117,12 @@ class Minibird:
         if reason:
             return reason
         if sample is not instrument.used:
-            turn = np.array(sample.quaternion)
+            position, turn = np.array(sample.position), np.array(sample.quaternion)
             if self._stream.inverse[sample.address]:
                 turn = quaternion_conjugate(turn)
-            pose = self._placer.world_from_tool(k, np.array(sample.position), turn, instrument.bird)
-            if self._closure is not None and self._closure.has(tool) and instrument.used is not None:
-                self._closure.moved(tool, math.dist(sample.position, instrument.used.position), now)
+            pose = self._placer.world_from_tool(k, position, turn, instrument.bird)
+            if self._closure is not None and self._closure.has(tool):
+                self._closure.moved(tool, position, now)
             self._position[k], self._quaternion[k] = pose.position, pose.quaternion
             instrument.used = sample
             self._latency.used(sample.sent_s)
@@ -150,11 +149,12 @@ class Minibird:
 
     def summary(self) -> dict[str, object]:
         """What was read, how late, and when and why it was not."""
+        jitter_s = self._line.jitter_s
         return {
             "driver": "minibird",
             "records": dict(sorted(self._stream.counts.items())),
-            "measured_rate_hz": round(1.0 / self._line.period_s, 3),
-            "jitter_ms": round(1e3 * self._line.jitter_s, 3),
+            "measured_rate_hz": round(self._line.rate_hz, 3),
+            "jitter_ms": None if jitter_s is None else round(1e3 * jitter_s, 3),
             "latency_ms": self._latency.summary(),
             "restarts": self._stream.restarts,
             **self._losses.summary(),

@@ -13,6 +13,9 @@ POSITION_ANGLES = b"Y"
 POINT = b"B"
 STREAM = b"@"
 STREAM_STOP = b"?"
+REPORT_EACH_CYCLE = b"Q"
+NO_BUTTON = b"M\x00"  # BUTTON MODE: no byte of the buttons behind a record
+NO_METAL = b"s\x00\x00"  # METAL: no byte of the field's distortion
 RUN = b"F"
 SLEEP = b"G"
 
@@ -103,21 +106,15 @@ def measurement_rate(hz: float) -> bytes:
 
 @dataclass(frozen=True)
 class UnitStatus:
-    """The status word (parameter 0) of a unit."""
+    """Of the status word (parameter 0) of a unit, what the driver goes by."""
 
     master: bool
-    initialised: bool
-    error: bool
-    running: bool
     expanded: bool  # addresses up to 30
-    asleep: bool
-    streaming: bool
 
     @staticmethod
     def read(reply: bytes) -> UnitStatus:
         word = int.from_bytes(reply, "little")
-        bits = [bool(word >> k & 1) for k in (15, 14, 13, 12, 10, 5, 0)]
-        return UnitStatus(*bits)
+        return UnitStatus(master=bool(word >> 15 & 1), expanded=bool(word >> 10 & 1))
 
 
 @dataclass(frozen=True)
@@ -127,8 +124,7 @@ class BirdStatus:
     accessible: bool
     running: bool
     sensor: bool
-    transmitters: int  # bits 3 to 0
 
     @staticmethod
     def read(byte: int) -> BirdStatus:
-        return BirdStatus(bool(byte & 0x80), bool(byte & 0x40), bool(byte & 0x20), byte & 0x0F)
+        return BirdStatus(bool(byte & 0x80), bool(byte & 0x40), bool(byte & 0x20))

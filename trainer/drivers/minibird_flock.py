@@ -37,12 +37,6 @@ class Silences:
     drain_s: float = 0.05  # after the stream was stopped
     answer_s: float = 0.5  # for an answer to come
 
-    def faster(self, times: float) -> Silences:
-        """For devices that are simulated faster than real time."""
-        return Silences(
-            self.reset_s / times, self.hold_s / times, self.configure_s / times, self.drain_s, self.answer_s
-        )
-
 
 #: As the units want it.
 UNHURRIED = Silences()
@@ -58,7 +52,8 @@ class Flock:
         self._silences = silences
         self._pause = pause
         self._addresses = tuple(sorted(bird.address for bird in spec.bird))
-        self._master = self._addresses[0]
+        #: The unit that speaks for all is that of address 1, also where it moves nothing.
+        self._master = 1 if spec.port else self._addresses[0]
         self._urls = {b.address: b.port for b in spec.bird} if not spec.port else {self._master: spec.port}
         self._ports: dict[int, Any] = {}  # by the address of the unit that is plugged in there
         group = bool(spec.port)
@@ -85,6 +80,8 @@ class Flock:
                 self._introduce(address)
                 self._say(address, commands.change(commands.GROUP_MODE, b"\x00"))  # as an earlier program left it
             self._configure()
+            self._undo()
+            self._say(self._master, commands.measurement_rate(self._spec.rate_hz))
             for address in self._addresses:
                 self._set_up(address)
             if self._spec.port:
@@ -207,11 +204,15 @@ class Flock:
         reply = self._ask(self._master, commands.examine(commands.FLOCK_STATUS), MOST)
         return [commands.BirdStatus.read(byte) for byte in reply]
 
+    def _undo(self) -> None:
+        """What an earlier program may have left: records that are left out, or that are longer by a byte."""
+        for address in range(1, self._addresses[-1] + 1) if self._spec.port else self._addresses:
+            for command in (commands.REPORT_EACH_CYCLE, commands.NO_BUTTON, commands.NO_METAL):
+                self._say(address, command)
+
     def _set_up(self, address: int) -> None:
         self._say(address, commands.hemisphere(self._spec.hemisphere))
         self._say(address, commands.change(commands.POSITION_SCALE, b"\x00\x00"))  # 36 inches
-        if address == self._master:
-            self._say(address, commands.measurement_rate(self._spec.rate_hz))
         if self._spec.quaternion != "measured":
             self.inverse[address] = self._spec.quaternion == "inverse"
         elif address not in self.inverse:

@@ -41,6 +41,7 @@ class FlockStream:
         self._failed = threading.Event()
         self._flock = Flock(spec, silences, self._pause)
         self._heard_s: dict[int, float] = {}  # when a bird last said something believable
+        self._unheard: set[int] = set()  # birds of which nothing has come since the stream began
         self._keeper: threading.Thread | None = None
         self.trouble = ""  # why nothing comes now
         self.restarts = 0
@@ -54,7 +55,7 @@ class FlockStream:
     @property
     def counts(self) -> Counter[str]:
         """Samples by flaw, "good" ones and "dropped bytes", of the whole session."""
-        return sum((parser.counts for parser in self._flock.parsers.values()), Counter())
+        return sum((parser.counts.copy() for parser in self._flock.parsers.values()), Counter())
 
     def start(self) -> None:
         self._keeper = threading.Thread(target=self._keep, name="flock", daemon=True)
@@ -100,6 +101,7 @@ class FlockStream:
             return
         self._failed.clear()
         self._heard_s = dict.fromkeys(self._addresses, time.monotonic())
+        self._unheard = set(self._addresses)
         readers = [threading.Thread(target=self._read, args=line, name="bird", daemon=True) for line in lines.values()]
         for reader in readers:
             reader.start()
@@ -126,5 +128,12 @@ class FlockStream:
                 if sample.address in self._heard_s:
                     if sample.flaw in ("", MIRROR):
                         self._heard_s[sample.address] = sample.arrived_s
-                        self.trouble = ""
+                        self._welcome(sample.address)
                     self._take(sample)
+
+    def _welcome(self, address: int) -> None:
+        """A bird is back. The trouble is over with the last one, once: that of a bird falling silent comes later."""
+        if address in self._unheard:
+            self._unheard.discard(address)
+            if not self._unheard:
+                self.trouble = ""

@@ -10,7 +10,7 @@ import numpy as np
 
 from trainer.config import ConfigError
 from trainer.drivers.live import Reading, flawed
-from trainer.drivers.makers import failures, library, stdout_kept
+from trainer.drivers.makers import failures, library
 from trainer.drivers.plausible import FARTHEST_MM, LENGTH_TOLERANCE
 from trainer.drivers.serial_port import DeviceError
 from trainer.profile import NdiSpec
@@ -43,7 +43,7 @@ class Tracker:
         else:
             settings["serial port"] = spec.port
         self._frames = [-1.0] * len(self._names)
-        with failures(self._where), stdout_kept():  # it has the network's `ping` print
+        with failures(self._where):
             self._tracker: Any = module.NDITracker(settings)
         try:
             with failures(self._where):

@@ -40,6 +40,10 @@ def read(path: str | Path) -> Motion:
         raise ConfigError(
             f"{name}: is cut short or no XML: line {line}, column {column}: {str(error).partition(':')[0]}"
         ) from None
+    except ConfigError:
+        raise
+    except (LookupError, ValueError) as error:  # an encoding that nobody knows, or of several bytes a character
+        raise ConfigError(f"{name}: its encoding cannot be read: {error}; save it as UTF-8") from None
     except OSError as error:
         raise ConfigError(f"{name}: {'no such file' if not Path(path).exists() else error.strerror}") from None
     if not found:

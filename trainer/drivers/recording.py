@@ -41,6 +41,8 @@ from trainer.motion import Motion, Track
 from trainer.poses import ToolPoses
 from trainer.profile import RecordingSpec, Sensor
 
+#: A longer recording has a broken time stamp, or times in another unit.
+LONGEST_S = 86400.0
 #: Why an instrument is lost: samples are missing there, or are not OK.
 UNSEEN = "missing from the recording"
 
@@ -117,7 +119,9 @@ def check_sensors(motion: Motion, spec: RecordingSpec) -> None:
 
 
 def tick_times(motion: Motion, tick_hz: float) -> Array:
-    """Times (m,) s from the first sample of all ticks up to the last sample."""
+    """Times (m,) s from the first sample of all ticks up to the last sample. Raises ConfigError beyond a day."""
+    if not motion.duration_s <= LONGEST_S:
+        raise ConfigError(f"{motion.path}: lasts {motion.duration_s:g} s; are its times in seconds?")
     # A millionth of a tick decides that a last tick at the very time of the last sample is one.
     return np.arange(int(np.floor(motion.duration_s * tick_hz + 1e-6)) + 1) / tick_hz
 

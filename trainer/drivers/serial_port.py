@@ -3,10 +3,22 @@
 from __future__ import annotations
 
 import errno
+import re
+import sys
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import serial
+
+#: What opening a port raises: a port that goes while it is opened has the terminal's own error, no OSError.
+if sys.platform == "win32":
+    REFUSALS: tuple[type[Exception], ...] = (OSError, ValueError)
+else:
+    import termios
+
+    REFUSALS = (OSError, ValueError, termios.error)
 
 #: A read that gets nothing returns after this long, so that a thread sees soon that it is to end.
 READ_S = 0.05
@@ -24,17 +36,31 @@ def open_port(url: str, baud: int) -> Any:
     opened, since pyserial would raise both. A pseudo-terminal has neither line; setting them before is no error there.
     """
     try:
-        port = serial.serial_for_url(url, do_not_open=True)
+        if url.startswith(("socket://", "rfc2217://")) and urlsplit(url).port is None:
+            raise ValueError("its address has no port; give host:port")
+        port = serial.serial_for_url(_fresh_log(url), do_not_open=True)
         port.baudrate = baud
         port.timeout, port.write_timeout = READ_S, WRITE_S
         port.rts, port.dtr = False, True
         if isinstance(port, serial.Serial) and hasattr(port, "exclusive"):
             port.exclusive = True
         port.open()
-    except (OSError, ValueError) as error:
+    except REFUSALS as error:
         raise DeviceError(f"{url}: {_why(error)}") from None
     _hand_over_at_once(port)
     return port
+
+
+def _fresh_log(url: str) -> str:
+    """The address, its log of bytes (``spy://…?file=``) under a name of its own: pyserial would begin it anew."""
+    found = re.fullmatch(r"(spy://.*[?&]file=)([^&]+)(.*)", url)
+    if found is None:
+        return url
+    log, count = found[2], 1
+    while Path(log).is_file():
+        count += 1
+        log = f"{found[2]}.{count}"
+    return f"{found[1]}{log}{found[3]}"
 
 
 def _hand_over_at_once(port: Any) -> None:
@@ -45,8 +71,8 @@ def _hand_over_at_once(port: Any) -> None:
             ask(True)
 
 
-def _why(error: OSError | ValueError) -> str:
-    number = error.errno if isinstance(error, OSError) else None
+def _why(error: Exception) -> str:
+    number = error.args[0] if error.args else None
     if "exclusively lock" in str(error) or number in (errno.EBUSY, errno.EAGAIN):
         return "in use by another program; end that one first"
     if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.EIO):

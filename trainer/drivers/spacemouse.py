@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from trainer.drivers.live import LivePoses, Reading, check_tools
-from trainer.drivers.makers import failures, library, stdout_kept
+from trainer.drivers.makers import failures, library
 from trainer.drivers.serial_port import DeviceError
 from trainer.geometry import (
     Array,
@@ -93,7 +93,7 @@ class Cap:
         self._name = spec.device or "SpaceMouse"
         self._hand = hand
         module = library("pyspacemouse", "pyspacemouse")
-        with failures(self._name), stdout_kept():  # it prints what it found
+        with failures(self._name):
             self._device: Any = module.open(
                 device=spec.device or None, axis_convention=module.AxisConvention.HID_Z_UP, nonblocking=True
             )

@@ -5,14 +5,12 @@ from __future__ import annotations
 import time
 from collections import deque
 from contextlib import ExitStack, closing
-from dataclasses import replace
 from types import TracebackType
 
 import numpy as np
 
 from trainer.calibration import CalibrationError
 from trainer.config import ConfigError
-from trainer.drivers.clock_line import ClockLine
 from trainer.drivers.closure import ClosureSensor
 from trainer.drivers.minibird_flock import UNHURRIED
 from trainer.drivers.minibird_record import Sample
@@ -26,6 +24,8 @@ from trainer.profile import Profile
 STILL_S = 1.0
 STILL_MM = 1.5
 FEWEST = 20  # samples of a touch
+#: A shorter silence is a record on its way: ten periods, assumed.
+SILENT_S = 0.1
 
 
 class Watch:
@@ -35,12 +35,10 @@ class Watch:
         """Connects, configures and begins the stream. Raises ConfigError for another driver, DeviceError."""
         spec = profile.minibird
         if profile.driver != "minibird" or spec is None:
-            raise ConfigError(f"device '{profile.name}' receives no records, so there is nothing to look at")
+            raise ConfigError(f"device '{profile.name}' cannot be read now, only miniBIRDs can; give files of readings")
         self._spec = spec
         self._keep_s = keep_s
         self._samples: dict[int, deque[Sample]] = {bird.address: deque() for bird in spec.bird}
-        self._line = ClockLine(1.0 / spec.rate_hz)
-        self._due: deque[float] = deque()  # of the first bird's samples, by the device's clock
         with ExitStack() as opened:
             self._closure = (
                 opened.enter_context(closing(ClosureSensor(profile.closure))) if profile.closure is not None else None
@@ -49,6 +47,7 @@ class Watch:
             if self._closure is not None:
                 self._closure.wait()
             self._stream.start()
+            self._begun_s = time.monotonic()
             self._opened = opened.pop_all()
 
     def __enter__(self) -> Watch:
@@ -64,18 +63,14 @@ class Watch:
         kept = self._samples.get(sample.address)
         if kept is None:
             return
-        if sample.address == self._spec.bird[0].address:
-            self._due.append(self._line.observe(sample.sent_s))
-            while self._due[-1] - self._due[0] > self._keep_s:
-                self._due.popleft()
         kept.append(sample)
         while sample.arrived_s - kept[0].arrived_s > self._keep_s:
             kept.popleft()
 
     def samples(self, address: int) -> list[Sample]:
         """A copy; the thread that reads goes on."""
-        kept = self._samples[address]
-        return list(kept.copy())
+        since = time.monotonic() - self._keep_s
+        return [sample for sample in self._samples[address].copy() if sample.arrived_s >= since]
 
     @property
     def trouble(self) -> str:
@@ -88,10 +83,16 @@ class Watch:
         return dict(sorted(self._stream.counts.items()))
 
     def arrival(self) -> Arrival:
-        """Of the first bird's records. Those lost show by the device's clock, on which bunched ones do not seem so."""
-        arrived = np.array([sample.arrived_s for sample in self.samples(self._spec.bird[0].address)])
-        by_clock = arrival(np.maximum.accumulate(np.array(self._due.copy())), nominal_hz=1.0 / self._line.period_s)
-        return replace(arrival(arrived), lost=by_clock.lost, loss_percent=by_clock.loss_percent)
+        """Of the first bird's records; lost are those that are missing of the rate that was asked for."""
+        return self._arrival(self.samples(self._spec.bird[0].address))
+
+    def _arrival(self, kept: list[Sample]) -> Arrival:
+        now = time.monotonic()
+        begun = max(self._begun_s, now - self._keep_s)
+        arrived = np.array([sample.arrived_s for sample in kept])
+        first, last = (arrived[0], arrived[-1]) if kept else (now, begun)
+        span = (begun if first - begun > SILENT_S else first, now if now - last > SILENT_S else last)
+        return arrival(arrived, nominal_hz=self._spec.rate_hz, span=span)
 
     def seen(self) -> dict[str, tuple[str, Seen]]:
         """By sensor (bird1 …): its tool, and what it said; ``ok`` are the samples without flaw."""
@@ -105,7 +106,7 @@ class Watch:
                 share, trouble = self._closure.closure(bird.tool, now)
                 closure = None if trouble else np.array([share])
             ok = np.array([not sample.flaw for sample in kept], dtype=bool)
-            found[f"bird{bird.address}"] = (bird.tool, seen(position, ok, closure))
+            found[f"bird{bird.address}"] = (bird.tool, seen(position, ok, closure, self._arrival(kept).lost or 0))
         return found
 
     def poses(self, address: int, seconds: float) -> tuple[Array, Array]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
@@ -67,6 +68,11 @@ class Faults:
         return bytes(out)
 
 
+#: What only a closure sensor can have, and what only trackers can.
+CLOSURES = ("stuck", "out-of-range")
+TRACKERS = ("hemisphere", "power-cycle", "no-bird", "mute", "garbage")
+
+
 def parse(texts: Sequence[str]) -> tuple[Faults, Faults]:
     """Faults of the trackers and of the closure sensor: ``drop=0.01``, ``unplug=3:5``, ``closure:pause=2:1``.
 
@@ -82,6 +88,9 @@ def parse(texts: Sequence[str]) -> tuple[Faults, Faults]:
 
 def _value(text: str, name: str, value: str) -> float | int | bool | Span:
     known = {f.name.replace("_", "-"): f.default for f in fields(Faults)}
+    others, whose = (TRACKERS, "a closure sensor") if text.startswith("closure:") else (CLOSURES, "a tracker")
+    if name in others:
+        raise ConfigError(f"--fault {text}: {whose} cannot have it")
     if name not in known:
         raise ConfigError(f"--fault {text}: unknown fault '{name}'; known: {', '.join(known)}")
     default = known[name]
@@ -92,8 +101,15 @@ def _value(text: str, name: str, value: str) -> float | int | bool | Span:
             return True
         if isinstance(default, Span):
             start, _, length = value.partition(":")
-            return Span(float(start), float(length or "1"))
-        return int(value) if isinstance(default, int) else float(value)
+            span = Span(float(start), float(length or "1"))
+            if not (0.0 <= span.start_s < math.inf and 0.0 < span.length_s < math.inf):
+                raise ValueError
+            return span
+        number = int(value) if isinstance(default, int) else float(value)
+        if not (number >= 1 if isinstance(default, int) else 0.0 <= number <= 1.0):
+            raise ValueError
+        return number
     except ValueError:
-        kind = {bool: "no value", Span: "START:LENGTH in s"}.get(type(default), "a number")
+        kinds = {bool: "no value", Span: "START:LENGTH in s", int: "an address"}
+        kind = kinds.get(type(default), "a number from 0 to 1")
         raise ConfigError(f"--fault {text}: '{name}' takes {kind}") from None

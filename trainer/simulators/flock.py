@@ -64,6 +64,7 @@ class Unit:
     streaming: bool = False
     halted: bool = False  # by XOFF
     report: int = 1  # every so many cycles
+    extras: dict[int, bool] = field(default_factory=dict)  # whether 'M' or 's' append their byte to a record
     command: bytearray = field(default_factory=bytearray)  # what came so far at its own port
 
     def fail(self, code: int) -> None:
@@ -158,6 +159,8 @@ class Flock:
             unit.values[22] = arguments
         elif code in REPORTS:
             unit.report = REPORTS[code]
+        elif code in b"Ms":
+            unit.extras[code] = arguments[0] == 1
         elif code in b"FG":
             self.asleep = code == ord("G")
         elif code == 0x13:
@@ -263,4 +266,4 @@ class Flock:
             ord("V"): position, ord("W"): turn, ord("X"): matrix, ord("Y"): position + turn,
             ord("Z"): position + matrix, ord("\\"): quaternion, ord("]"): position + quaternion,
         }[unit.format]  # fmt: skip
-        return encode(words) + (bytes((address,)) if self.group else b"")
+        return encode(words) + bytes(sum(unit.extras.values())) + (bytes((address,)) if self.group else b"")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import select
 import time
 from collections.abc import Callable
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from trainer.config import ConfigError
 from trainer.geometry import Rigid
 from trainer.profile import ClosureSpec, MinibirdSpec
 from trainer.simulators.closure_board import BOOT, RATE_HZ, ClosureBoard
@@ -36,11 +38,14 @@ class Station:
         closure_faults: Faults,
         seed: int,
     ) -> None:
+        """Raises ConfigError where the missing bird is none of them, or the only one."""
         self._hands, self._speed, self._faults, self._closure_faults = hands, speed, faults, closure_faults
         self._rng = np.random.default_rng(seed)
         self._birds = {address: k for k, address in enumerate(hands.addresses)}
         self._tools = {bird.address: bird.tool for bird in spec.bird}
         present = [a for a in self._birds if a != faults.no_bird]
+        if not present or faults.no_bird not in (0, *self._birds):
+            raise ConfigError(f"--fault no-bird={faults.no_bird}: one of {len(self._birds)}, and another must be there")
         self._flock = Flock(present, self._pose, SILENCE_S / speed)
         own = [bird.address for bird in spec.bird] if not spec.port else [min(self._birds)]
         self._lines = {
@@ -51,7 +56,7 @@ class Station:
         self._closure_line = (
             Line(ports[-1], closure.baud, speed, closure_faults, self._rng, PACKET) if closure is not None else None
         )
-        self._closure_s = 0.0  # when the next line is due
+        self._closure_s = 0.0 if closure is not None else math.inf  # when the next line is due
         self._begun_s: float | None = None  # when the first stream was asked for: motion begins
         self._cycle_s = 0.0  # when the next measurement cycle ends
         self._sample = 0  # of a motion that is sampled by itself
@@ -160,16 +165,20 @@ class Station:
 
 
 def with_ports(text: str, ports: list[Path], in_scene: bool) -> str:
-    """A profile's text with its ports replaced, in the order in which they stand there.
+    """A profile's text with its ports replaced: those of the flock or its birds in their order, then the board's.
 
     Motion that is given in the scene is anchored by the profile's mapping, not by where it begins.
     """
     lines = []
-    left = list(ports)
+    flock, table = iter(ports), ""
     for line in text.splitlines():
         key = line.partition("=")[0].strip()
-        if key == "port" and left:
-            line = f'port = "{left.pop(0)}"'
+        if key.startswith("["):
+            table = key.partition("]")[0].strip("[ ")
+        if key == "port" and table in ("minibird", "minibird.bird"):
+            line = f'port = "{next(flock)}"'
+        elif key == "port" and table == "closure":
+            line = f'port = "{ports[-1]}"'
         elif key == "anchor" and in_scene:
             line = 'anchor = "none"'
         lines.append(line)

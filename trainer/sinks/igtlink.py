@@ -6,6 +6,7 @@ of the world. A tick hands its poses to a thread and goes on; whoever does not r
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
 import threading
@@ -18,6 +19,7 @@ from trainer.sinks.surface import TickRecord
 MOST_CLIENTS = 16
 #: Bytes that may wait in the kernel for a client, who else would be shown the past: some 150 messages, assumed.
 WAITING = 16384
+FREE_PORT = "give 'port' in [publish] one that is free"
 
 
 class PublishError(Exception):
@@ -32,8 +34,11 @@ class IgtlinkSink:
         try:
             self._listener = socket.create_server((host, port))
         except (OSError, OverflowError) as error:
-            why = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else error
-            raise PublishError(f"{host}:{port}: {why}; give 'port' in [publish] one that is free") from None
+            number = (isinstance(error, OSError) and error.errno) or 0  # those of a name's look-up are negative
+            why = os.strerror(number) if number > 0 else str(getattr(error, "strerror", error)).partition(" (")[0]
+            elsewhere = number < 0 or number == errno.EADDRNOTAVAIL
+            fix = "give 'host' in [publish] an address of this machine" if elsewhere else FREE_PORT
+            raise PublishError(f"{host}:{port}: {why}; {fix}") from None
         self._listener.setblocking(False)
         self.port: int = self._listener.getsockname()[1]
         self._clients: dict[socket.socket, bytes] = {}  # and what of its last message it did not take

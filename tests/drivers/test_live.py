@@ -1,0 +1,48 @@
+"""A device that tells poses is opened again whatever opening it says, until it is there."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+from live_polling import HOME, TICK_HZ, TOOLS, Polling
+
+from trainer.config import ConfigError
+from trainer.drivers.live import Connection, LivePoses, Reading
+from trainer.drivers.serial_port import DeviceError
+from trainer.profile import Registration, Tracked
+
+
+class Connected:
+    """A device that is there, or is gone at once."""
+
+    def __init__(self, gone: bool) -> None:
+        self._gone = gone
+
+    def read(self) -> list[Reading]:
+        time.sleep(0.005)
+        if self._gone:
+            raise DeviceError("gone")
+        return [Reading("sensor", time.monotonic(), np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))]
+
+    def close(self) -> None:
+        """There is nothing to give back."""
+
+
+def test_a_file_that_is_missing_for_a_while_does_not_end_the_reconnecting() -> None:
+    tries = 0
+
+    def connect() -> Connection:
+        nonlocal tries
+        tries += 1
+        if tries == 2:
+            raise ConfigError("tool.rom: no such ROM file")
+        return Connected(gone=tries == 1)
+
+    sensor = Tracked(name="sensor", tool="left")
+    driver = LivePoses("ndi", connect, Registration(), (sensor,), None, TOOLS, TICK_HZ, HOME)
+    polling = Polling(driver)
+    polling.until(lambda poses: driver.summary()["reconnects"] == 1)
+    driver.close()
+    assert tries == 3
+    assert "no such ROM file" in polling.reasons()
