@@ -29,6 +29,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "events": set(),
     "geometry": set(),
     "clock": set(),
+    "own_core": set(),
     "serial_ports": set(),
     "image_header": {"config"},
     "openigtlink": {"geometry"},

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -106,6 +106,7 @@ def perform(
     from trainer.drivers.makers import stdout_kept
     from trainer.log.record import ANATOMY, ANATOMY_SHA256, TOLERANCE
     from trainer.metrics.registry import check_targets, score
+    from trainer.own_core import own_core
     from trainer.reporting.wording import out_of_sight
     from trainer.scene import build
     from trainer.session import interruptible, old_objects_left_alone, run
@@ -144,7 +145,8 @@ def perform(
         published = profile.profile.publish
         sinks.append(stack.enter_context(closing(IgtlinkSink(published.host, published.port, scene.tools))))
     log = stack.enter_context(closing(LogSink(log_path, header)))
-    with closing(Progress(task)) as progress, interruptible() as interrupted, old_objects_left_alone():
+    undisturbed = own_core() if clock.realtime else nullcontext()
+    with closing(Progress(task)) as progress, interruptible() as interrupted, old_objects_left_alone(), undisturbed:
         told: list[Sink] = [driver] if isinstance(driver, LiveDriver) else []
         if observed is not None:
             told.append(observed(driver, [log, *sinks]))

@@ -71,6 +71,7 @@ class Compliance:
             for b, (lo, hi) in enumerate(self.links)
         ]
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="factor", initializer=_give_way)
+        self._thread.submit(_begin)  # a thread that began now is there when a session places its threads
         unknowns = 3 * max(len(order) for order in orders)
         self._push, self._v = np.zeros((n, 3)), np.zeros(unknowns, dtype=np.float32)
         self._thread_push, self._thread_v = self._push.copy(), self._v.copy()
@@ -196,6 +197,10 @@ class Compliance:
         self.columns = _grown(self.columns, (new, *self.columns.shape[1:]))
         self._next_columns = _grown(self._next_columns, self.columns.shape)
         self.matrix = _grown(self.matrix, (3 * new, 3 * new))
+
+
+def _begin() -> None:
+    """The thread's first work: none."""
 
 
 def _give_way() -> None:
