@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -151,3 +152,14 @@ def test_a_simulation_does_not_overwrite_its_profile(tmp_path: Path) -> None:
     assert isinstance(got.exception, ConfigError)
     assert "is the profile itself; give --out another folder" in str(got.exception)
     assert profile.read_text() == before
+
+
+def test_a_file_that_is_neither_profile_nor_recording_is_told_so(
+    command_line: Callable[..., tuple[int, str, str]], tmp_path: Path
+) -> None:
+    path = tmp_path / "poses.dat"
+    path.write_text("1 2 3\n", encoding="utf-8")
+    code, out, err = command_line("devices", "check", path)
+    assert (code, out) == (1, "")
+    assert err.count("\n") == 1
+    assert "neither a profile (.toml) nor a recording by its name (.mha, " in err

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing, nullcontext
@@ -51,6 +52,8 @@ def practice(
         raise typer.BadParameter("--record and --no-record exclude each other")
     if record is not None and record.suffix != ".rrd":
         raise typer.BadParameter(f"--record needs a name that ends in .rrd, found {record}")
+    if sys.stderr.isatty():  # what follows takes seconds
+        typer.echo("getting ready…", err=True)
 
     from trainer.clock import Fast, Realtime
     from trainer.curriculum import load_task

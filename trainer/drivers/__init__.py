@@ -43,6 +43,9 @@ def open_profile(reference: str) -> ProfileFile:
     A recording is played by a shipped profile with its path filled in; the text is that of the filled-in profile.
     """
     if not is_recording(reference):
+        if Path(reference).is_file() and Path(reference).suffix != ".toml":
+            known = ", ".join(PLAYED_BY)
+            raise ConfigError(f"{reference}: neither a profile (.toml) nor a recording by its name ({known})")
         return load_profile(reference)
     name = "logged-session" if is_logged(reference) else PLAYED_BY[Path(reference).suffix.lower()]
     if name is None:
