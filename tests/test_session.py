@@ -182,13 +182,17 @@ def test_a_device_in_a_hand_is_asked_in_the_tick_and_a_scripted_hand_before_it(
 
 
 def test_a_second_ctrl_c_raises_and_the_handler_is_put_back() -> None:
-    before = signal.getsignal(signal.SIGINT)
-    with interruptible() as interrupted:
-        os.kill(os.getpid(), signal.SIGINT)
-        assert interrupted()
-        with pytest.raises(KeyboardInterrupt):
+    here = signal.getsignal(signal.SIGINT)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores Ctrl-C
+    try:
+        with interruptible() as interrupted:
             os.kill(os.getpid(), signal.SIGINT)
-    assert signal.getsignal(signal.SIGINT) is before
+            assert interrupted()
+            with pytest.raises(KeyboardInterrupt):
+                os.kill(os.getpid(), signal.SIGINT)
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, here)
 
 
 class SlowTime:

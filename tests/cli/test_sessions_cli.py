@@ -99,7 +99,7 @@ def test_score_is_computed_from_the_log_and_the_stored_task(path: Path, monkeypa
 class FakeScene:
     """Pierces at every third tick, as the samples' events say, provided that the poses are the recorded ones."""
 
-    def __init__(self, task: Task) -> None:
+    def __init__(self, task: Task, anatomy: object = None) -> None:
         self.tick = 0
         self.outcome = ""
 
