@@ -153,7 +153,7 @@ def test_a_short_run_writes_its_report(command_line: CommandLine, tmp_path: Path
     text = load_task("anastomosis/needle-drive").text
     task = tmp_path / "drive.toml"
     text = text.replace('name = "needle-drive"', 'name = "drive"', 1)
-    task.write_text(text.replace("time_limit_s = ", "time_limit_s = 1.0 # "))
+    task.write_text(text.replace("time_limit_s = ", "time_limit_s = 4.0 # "))
     out = tmp_path / "reports"
     code, said, err = command_line("bench", "soak", "--minutes", "0.1", "--task", task, "--out", out, "--json")
     assert code == 0, err
