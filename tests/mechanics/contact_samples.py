@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import tracemalloc
-from collections.abc import Callable
-
 import numpy as np
 from hypothesis import strategies as st
 from numba import njit
@@ -78,22 +75,3 @@ def all_own_pairs(x, segments, along, neighbours, margin):  # type: ignore[no-un
                 if d <= margin * margin:
                     out.append((s, o))
     return out
-
-
-def kept_bytes(work: Callable[[], object]) -> tuple[int, int]:
-    """Bytes that ten runs of ``work`` keep, and the most that they need above what was there, after a warm-up.
-
-    An array that each run kept would be 1120 bytes at least: ten headers of 112.
-    """
-    work()
-    tracemalloc.start()
-    try:
-        work()  # what tracing itself keeps of the call
-        before, _ = tracemalloc.get_traced_memory()
-        tracemalloc.reset_peak()
-        for _ in range(10):
-            work()
-        after, peak = tracemalloc.get_traced_memory()
-    finally:
-        tracemalloc.stop()
-    return after - before, peak - before

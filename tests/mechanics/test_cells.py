@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from contact_samples import KINDS, all_pairs, chain, kept_bytes, margins, sample, samples
+from allocations import kept_bytes
+from contact_samples import KINDS, all_pairs, chain, margins, sample, samples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

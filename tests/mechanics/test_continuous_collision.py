@@ -10,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from contact_samples import chain, kept_bytes
+from allocations import kept_bytes
+from contact_samples import chain
 from hypothesis import example, given
 from hypothesis import strategies as st
 from numba import njit

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from contact_samples import all_own_pairs, chain, kept_bytes, margins, sample, samples
+from allocations import kept_bytes
+from contact_samples import all_own_pairs, chain, margins, sample, samples
 from hypothesis import given
 from hypothesis import strategies as st
 

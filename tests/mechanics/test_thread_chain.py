@@ -6,11 +6,11 @@ import math
 import os
 import subprocess
 import sys
-import tracemalloc
 from pathlib import Path
 
 import numpy as np
 import pytest
+from allocations import kept_bytes
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 from scipy.special import j0, jn_zeros
@@ -264,16 +264,8 @@ def test_a_tick_allocates_no_array() -> None:
     """A tick's peak of memory is below that of one more row (n,) of 8 kB; numba fills once what it keeps for calls."""
     model = chain(1000)
     state, held = begin_chain(model, straight(model)), holds(model, [0], [[0, 0, 0]])
-    step_chain(model, state, held, 1e-4)
-    tracemalloc.start()
-    peaks = []
-    for _ in range(50):
-        tracemalloc.reset_peak()
-        before = tracemalloc.get_traced_memory()[0]
-        step_chain(model, state, held, 1e-4)
-        peaks.append(tracemalloc.get_traced_memory()[1] - before)
-    tracemalloc.stop()
-    assert np.median(peaks) < 8 * model.count
+    _, peak = kept_bytes(lambda: step_chain(model, state, held, 1e-4))
+    assert peak < 8 * model.count
 
 
 def test_compiled_and_plain_python_agree() -> None:
