@@ -4,10 +4,11 @@ A matrix whose entries lie within b of the diagonal needs n b² multiplications 
 (Golub and Van Loan, Matrix Computations, section 4.3). The factor is kept by columns, and both substitutions take the
 three columns of a node at once: forwards they subtract multiples of contiguous stretches, backwards they sum products.
 
-The factor is computed in double precision and kept in whole numbers of 16 bits, a unit for each column; a solve adds up
-in single precision. It is bound by the memory that it reads, and this is half of what single precision reads: two
-vessels' factors then stay in the cache of a core. A solve is right to about 1e-4 of its answer, and L D Lᵀ positive
-definite as ever: a base for iterations that measure their own residual, not an answer.
+The factor is kept in whole numbers of 16 bits, a unit for each column; a solve adds up in single precision. It is bound
+by the memory that it reads, and this is half of what single precision reads: two vessels' factors then stay in the
+cache of a core. A solve is right to about 1e-4 of its answer, and L D Lᵀ positive definite as ever: a base for
+iterations that measure their own residual, not an answer. It is computed in double precision where it has to be told
+whether the matrix is singular, and in single precision, which takes half as long, where that is known.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ class BandedFactor(NamedTuple):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def assemble_band(blocks: Array, links: np.ndarray, place: np.ndarray, band: Array) -> None:
+def assemble_band(blocks: Array, links: np.ndarray, place: np.ndarray, band: np.ndarray) -> None:
     """Adds the link blocks (m, 3, 3) to ``band`` (3 f, b + 1 or more), band[j, k] = K[j + k, j].
 
     ``place`` (n,) is a node's position in the order of elimination, or -1 for a node without unknowns.
@@ -60,7 +61,7 @@ def assemble_band(blocks: Array, links: np.ndarray, place: np.ndarray, band: Arr
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def factor_band(
-    band: Array,
+    band: np.ndarray,
     diagonal: Array,
     columns: np.ndarray,
     unit: np.ndarray,
@@ -75,6 +76,7 @@ def factor_band(
     stays finite. Returns how often that was done: unless it is 0, the factor is that of another matrix.
     """
     n, b = columns.shape
+    number = band.dtype.type
     replaced = 0
     for j in range(n):
         size = min(b, n - 1 - j) + 1
@@ -82,8 +84,8 @@ def factor_band(
         while i + GROUP <= j:  # written out below for a GROUP of four
             # The last of them reaches furthest down; the others meet the band's zeros there.
             reach = min(size, i + 3 + b - j + 1)
-            m0, m1 = band[i, j - i] * inverse[i], band[i + 1, j - i - 1] * inverse[i + 1]
-            m2, m3 = band[i + 2, j - i - 2] * inverse[i + 2], band[i + 3, j - i - 3] * inverse[i + 3]
+            m0, m1 = number(band[i, j - i] * inverse[i]), number(band[i + 1, j - i - 1] * inverse[i + 1])
+            m2, m3 = number(band[i + 2, j - i - 2] * inverse[i + 2]), number(band[i + 3, j - i - 3] * inverse[i + 3])
             s0, s1 = band[i, j - i : j - i + reach], band[i + 1, j - i - 1 : j - i - 1 + reach]
             s2, s3 = band[i + 2, j - i - 2 : j - i - 2 + reach], band[i + 3, j - i - 3 : j - i - 3 + reach]
             target = band[j, :reach]
@@ -92,7 +94,7 @@ def factor_band(
             i += GROUP
         while i < j:
             reach = min(size, i + b - j + 1)
-            multiplier = band[i, j - i] * inverse[i]
+            multiplier = number(band[i, j - i] * inverse[i])
             source = band[i, j - i : j - i + reach]
             target = band[j, :reach]
             for k in range(reach):
@@ -200,12 +202,13 @@ class Band(NamedTuple):
 
     links: np.ndarray  # (m, 2) int32
     place: np.ndarray  # (n,) int32, a node's position in the order of elimination, or -1
-    values: Array  # (3 f, b + 1 + GROUP)
+    values: np.ndarray  # (3 f, b + 1 + GROUP) float32 or float64
     diagonal: Array  # (3 f,)
 
 
-def room(links: np.ndarray, order: np.ndarray, node_count: int) -> tuple[Band, BandedFactor]:
-    """For factors of a stiffness that the ``links`` (m, 2) add up to on the nodes ``order`` (f,)."""
+def room(links: np.ndarray, order: np.ndarray, node_count: int, number: type[np.floating]) -> tuple[Band, BandedFactor]:
+    """For factors of a stiffness that the ``links`` (m, 2) add up to on the nodes ``order`` (f,), each computed
+    in this kind of ``number``."""
     place = np.full(node_count, -1, dtype=np.int32)
     place[order] = np.arange(len(order), dtype=np.int32)
     ends = place[links]
@@ -214,7 +217,7 @@ def room(links: np.ndarray, order: np.ndarray, node_count: int) -> tuple[Band, B
     size = 3 * len(order)
     b = STRETCH * -(-3 * reach // STRETCH) + 2
     # Written now: a page of memory that is touched for the first time costs time, milliseconds for these.
-    band = Band(np.ascontiguousarray(links), place, np.full((size, b + 1 + GROUP), 0.0), np.zeros(size))
+    band = Band(np.ascontiguousarray(links), place, np.full((size, b + 1 + GROUP), number(0.0)), np.zeros(size))
     columns = np.full((size, b), 0, dtype=np.int16)
     unit = np.full(size, 1.0, dtype=np.float32)
     return band, BandedFactor(np.ascontiguousarray(order, dtype=np.int32), columns, unit, np.zeros(size))
@@ -236,7 +239,7 @@ def factor(blocks: Array, links: np.ndarray, order: np.ndarray, node_count: int)
     Raises ValueError when the matrix is not positive definite, that is when the nodes can move without
     stretching a link.
     """
-    band, out = room(links, order, node_count)
+    band, out = room(links, order, node_count, np.float64)
     if factor_blocks(blocks, band, out, SINGULAR):
         raise ValueError("the links do not hold all free nodes in place: the stiffness matrix is singular")
     return out

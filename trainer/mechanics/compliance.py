@@ -22,7 +22,7 @@ from trainer.mechanics.links import LinkMesh, link_blocks
 from trainer.mechanics.quasi_newton import at_points
 
 #: A new factor is taken so many solves after it was begun.
-LAG = 6
+LAG = 8
 #: Solves for which a new factor is used before another one of the same body may be begun.
 LASTS = 10
 #: At rest no pivot is below 0.4 of the diagonal. A state in which one is below this is nearly or truly unstable.
@@ -62,7 +62,7 @@ class Compliance:
         self.links = [(int(r[0]), int(r[-1]) + 1) for r in at]
         # What the thread writes is there, and was written to, before it begins: to be given fresh memory takes a system
         # milliseconds now and then, in which nothing else goes on.
-        rooms = [banded.room(mesh.links[lo:hi], orders[b], n) for b, (lo, hi) in enumerate(self.links)]
+        rooms = [banded.room(mesh.links[lo:hi], orders[b], n, np.float32) for b, (lo, hi) in enumerate(self.links)]
         self._bands, self._next = [band for band, _ in rooms], [factor for _, factor in rooms]
         self._blocks = np.full((max(hi - lo for lo, hi in self.links), 3, 3), 0.0)
         self._at = mesh.rest.copy()  # the state of the factor under way
