@@ -98,6 +98,10 @@ class Bird(Mount):
     tool: Literal["left", "right"]
     port: str = ""  # its own; empty: it reports through the flock's port
 
+    @property
+    def name(self) -> str:
+        return f"bird{self.address}"
+
 
 @dataclass(frozen=True)
 class MinibirdSpec(Registration):
@@ -272,9 +276,8 @@ def _calibrated(profile: Profile, name: str) -> Profile:
     if measured is None:
         return profile
     if profile.minibird is not None:
-        birds = _calibrated_tips(
-            profile.minibird.bird, [f"bird{b.address}" for b in profile.minibird.bird], measured, name
-        )
+        birds = profile.minibird.bird
+        birds = _calibrated_tips(birds, [bird.name for bird in birds], measured, name)
         return replace(profile, minibird=replace(_calibrated_place(profile.minibird, measured), bird=birds))
     if profile.openigtlink is not None:
         devices = profile.openigtlink.device

@@ -13,8 +13,8 @@ from trainer.poses import ToolPoses
 
 TOOLS = ("left", "right")
 HOME = ToolPoses(np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]), np.eye(4)[[0, 0]], np.ones(2), np.ones(2, dtype=bool))
-TICK_HZ = 200.0
-PATIENCE_S = 30.0  # on a machine with everything else to do; nothing waits so long on an idle one
+TICK_HZ = 200.0  # ten times slower than simulated devices, so that a busy machine can follow; the newest pose wins
+PATIENCE_S = 60.0  # on a machine with everything else to do; nothing waits so long on an idle one
 
 
 class Polling:
@@ -25,7 +25,10 @@ class Polling:
         self.ticks = 0
         self.last = HOME
 
-    def until(self, seen: Callable[[ToolPoses], bool]) -> ToolPoses:
+    def until(
+        self, seen: Callable[[ToolPoses], bool], told: Callable[[dict[str, Any]], bool] | None = None
+    ) -> ToolPoses:
+        """Until ``seen`` holds for the poses and ``told``, asked now and then, for the summary."""
         ends = time.monotonic() + PATIENCE_S
         while True:
             poses = self.driver.poll(self.ticks, None)
@@ -36,14 +39,16 @@ class Polling:
             np.testing.assert_array_equal(poses.position[lost], self.last.position[lost])
             np.testing.assert_array_equal(poses.closure[lost], self.last.closure[lost])
             self.last = poses
-            if seen(poses):
+            if seen(poses) and (told is None or (self.ticks % 20 == 0 and told(self.summary()))):
                 return poses
-            assert time.monotonic() < ends, f"{self.driver.summary()}"
+            assert time.monotonic() < ends, f"{self.summary()}"
+
+    def summary(self) -> dict[str, Any]:
+        return self.driver.summary()
 
     def reasons(self) -> str:
         """Why instruments were lost so far."""
-        lost: Any = self.driver.summary()["lost"]
-        return "; ".join(loss["reason"] for loss in lost)
+        return "; ".join(loss["reason"] for loss in self.summary()["lost"])
 
 
 def all_seen(poses: ToolPoses) -> bool:

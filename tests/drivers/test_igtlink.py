@@ -10,12 +10,14 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 
 import numpy as np
 import pytest
 from live_polling import HOME, TICK_HZ, TOOLS, Polling, all_seen, none_seen
 
 from trainer.config import ConfigError
+from trainer.drivers.connected import Connected
 from trainer.drivers.igtlink import Server
 from trainer.drivers.live import LivePoses
 from trainer.drivers.serial_port import DeviceError
@@ -65,7 +67,8 @@ def publishing(port: int = 0, poses: ToolPoses = POSES) -> Iterator[int]:
 
 def opened(port: int, spec: OpenigtlinkSpec | None = None) -> LivePoses:
     spec = spec or OpenigtlinkSpec(device=DEVICES, port=port)
-    return LivePoses("openigtlink", lambda: Server(spec), spec, spec.device, None, TOOLS, TICK_HZ, HOME)
+    source = partial(Connected, "openigtlink", partial(Server, spec))
+    return LivePoses(source, spec, spec.device, None, TOOLS, TICK_HZ, HOME)
 
 
 def test_published_poses_are_the_poses_that_are_read() -> None:

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 
 import numpy as np
 from live_polling import HOME, TICK_HZ, TOOLS, Polling
 
 from trainer.config import ConfigError
-from trainer.drivers.live import Connection, LivePoses, Reading
+from trainer.drivers.connected import Connected, Connection
+from trainer.drivers.live import LivePoses, Reading
 from trainer.drivers.serial_port import DeviceError
 from trainer.profile import Registration, Tracked
 
 
-class Connected:
+class Flaky:
     """A device that is there, or is gone at once."""
 
     def __init__(self, gone: bool) -> None:
@@ -37,10 +39,10 @@ def test_a_file_that_is_missing_for_a_while_does_not_end_the_reconnecting() -> N
         tries += 1
         if tries == 2:
             raise ConfigError("tool.rom: no such ROM file")
-        return Connected(gone=tries == 1)
+        return Flaky(gone=tries == 1)
 
     sensor = Tracked(name="sensor", tool="left")
-    driver = LivePoses("ndi", connect, Registration(), (sensor,), None, TOOLS, TICK_HZ, HOME)
+    driver = LivePoses(partial(Connected, "ndi", connect), Registration(), (sensor,), None, TOOLS, TICK_HZ, HOME)
     polling = Polling(driver)
     polling.until(lambda poses: driver.summary()["reconnects"] == 1)
     driver.close()

@@ -9,7 +9,7 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 import serial
+from live_polling import HOME, PATIENCE_S, TICK_HZ, TOOLS, Polling, all_seen, none_seen
 from simulated_devices import SHORT, SPEED, loaded, simulated
 
 from trainer.config import ConfigError
@@ -32,11 +33,6 @@ from trainer.simulators.faults import Faults, Span, parse
 
 REAL = Path(__file__).parents[3] / "shared/data/tracker/WaterTankBottomTranslationTrackerBuffer.igs.mha"
 needs_real = pytest.mark.skipif(not REAL.exists(), reason=f"the real recording {REAL.name} is not beside the checkout")
-
-TOOLS = ("left", "right")
-HOME = ToolPoses(np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]), np.eye(4)[[0, 0]], np.ones(2), np.ones(2, dtype=bool))
-TICK_HZ = 200.0  # ten times slower than the devices, so that a busy machine can follow; the newest pose wins
-PATIENCE_S = 60.0  # on a machine with everything else to do; nothing waits so long on an idle one
 
 
 @pytest.fixture(scope="module")
@@ -55,48 +51,11 @@ def opened(profile: Profile, silences: Silences = SHORT) -> Minibird:
     return Minibird(spec_of(profile), profile.closure, TOOLS, TICK_HZ, HOME, silences)
 
 
-class Polling:
-    """A session's loop without a scene: polls tick after tick until something is seen."""
-
-    def __init__(self, driver: Minibird) -> None:
-        self.driver = driver
-        self.ticks = 0
-        self.last = HOME
-
-    def until(self, seen: Callable[[ToolPoses], bool], told: Callable[[dict[str, Any]], bool] | None = None) -> None:
-        """Until ``seen`` holds for the poses and ``told``, asked now and then, for the summary."""
-        ends = time.monotonic() + PATIENCE_S
-        while True:
-            poses = self.driver.poll(self.ticks, None)
-            assert poses is not None
-            self.driver.tick(None)
-            self.ticks += 1
-            lost = ~poses.valid
-            # a lost instrument stays where it was, jaws and all
-            np.testing.assert_array_equal(poses.position[lost], self.last.position[lost])
-            np.testing.assert_array_equal(poses.closure[lost], self.last.closure[lost])
-            self.last = poses
-            if seen(poses) and (told is None or (self.ticks % 20 == 0 and told(self.summary()))):
-                return
-            assert time.monotonic() < ends, f"{self.summary()}"
-
-    def summary(self) -> dict[str, Any]:
-        return self.driver.summary()
-
-
-def all_seen(poses: ToolPoses) -> bool:
-    return bool(poses.valid.all())
-
-
 def said(summary: dict[str, Any], *reasons: str) -> bool:
     """Whether both instruments were lost, and are back, with all of ``reasons`` at least once."""
     return all(
         any(loss["tool"] == t and r in loss["reason"] for loss in summary["lost"]) for t in TOOLS for r in reasons
     )
-
-
-def none_seen(poses: ToolPoses) -> bool:
-    return not poses.valid.any()
 
 
 @needs_real

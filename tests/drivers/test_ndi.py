@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -14,6 +15,7 @@ from live_polling import HOME, TICK_HZ, TOOLS, Polling, all_seen, none_seen
 
 from trainer.config import ConfigError
 from trainer.drivers import ndi
+from trainer.drivers.connected import Connected
 from trainer.drivers.live import LivePoses
 from trainer.drivers.ndi import UNSEEN, Tracker
 from trainer.drivers.serial_port import DeviceError
@@ -79,7 +81,8 @@ def library(monkeypatch: pytest.MonkeyPatch) -> type[NDITracker]:
 
 
 def opened(spec: NdiSpec = AURORA, beside: Path = Path()) -> LivePoses:
-    return LivePoses("ndi", lambda: Tracker(spec, beside), spec, spec.sensor, None, TOOLS, TICK_HZ, HOME)
+    source = partial(Connected, "ndi", partial(Tracker, spec, beside))
+    return LivePoses(source, spec, spec.sensor, None, TOOLS, TICK_HZ, HOME)
 
 
 def moved(polling: Polling) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import enum
 import math
 import sys
+import threading
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -193,4 +194,4 @@ def test_a_thread_of_a_mouse_ends_with_the_session(library: Any) -> None:
     library.mice[0].fault = OSError("gone")
     Polling(driver).until(lambda poses: not none_seen(poses))
     driver.close()
-    assert not driver._thread.is_alive()
+    assert "spacemouse" not in [thread.name for thread in threading.enumerate()]

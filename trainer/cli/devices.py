@@ -93,7 +93,7 @@ def simulate(
     hands = open_hands(motion, spec)
     out = out.absolute()
     out.mkdir(parents=True, exist_ok=True)
-    ports = [out / "flock"] if spec.port else [out / f"bird{bird.address}" for bird in spec.bird]
+    ports = [out / "flock"] if spec.port else [out / bird.name for bird in spec.bird]
     ports += [out / "closure"] if closure is not None else []
     written = out / f"{file.profile.name}.toml"
     if written.exists() and file.path.endswith(".toml") and written.samefile(file.path):

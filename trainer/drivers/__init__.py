@@ -114,6 +114,7 @@ def _driver(file: ProfileFile, profile: Profile, task: Task, home: ToolPoses, se
 
 def _live(file: ProfileFile, tools: Sequence[str], tick_hz: float, home: ToolPoses) -> Driver:
     """A device that tells finished poses."""
+    from trainer.drivers.connected import Connected
     from trainer.drivers.live import LivePoses
 
     profile = file.profile
@@ -122,12 +123,13 @@ def _live(file: ProfileFile, tools: Sequence[str], tick_hz: float, home: ToolPos
         from trainer.drivers.igtlink import Server
 
         server = profile.openigtlink
-        return LivePoses("openigtlink", partial(Server, server), server, server.device, *session)
+        return LivePoses(partial(Connected, "openigtlink", partial(Server, server)), server, server.device, *session)
     if profile.ndi is not None and profile.driver == "ndi":
         from trainer.drivers.ndi import Tracker
 
         tracker = profile.ndi
-        return LivePoses("ndi", partial(Tracker, tracker, _beside(file)), tracker, tracker.sensor, *session)
+        connect = partial(Tracker, tracker, _beside(file))
+        return LivePoses(partial(Connected, "ndi", connect), tracker, tracker.sensor, *session)
     from trainer.drivers.spacemouse import open_spacemouse
 
     assert profile.spacemouse is not None

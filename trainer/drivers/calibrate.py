@@ -52,7 +52,7 @@ def mapping(profile: Profile) -> RecordingSpec:
     if profile.driver == "recording" and profile.recording is not None and profile.recording.sensor:
         return profile.recording
     if profile.driver == "minibird" and flock is not None:
-        return _mapping(flock, {f"bird{bird.address}": (bird.tool, bird) for bird in flock.bird})
+        return _mapping(flock, {bird.name: (bird.tool, bird) for bird in flock.bird})
     if profile.driver == "openigtlink" and server is not None:
         return _mapping(server, {device.name: (device.tool, device) for device in server.device})
     if profile.driver == "ndi" and tracker is not None:

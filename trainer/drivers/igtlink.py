@@ -7,7 +7,8 @@ import time
 
 import numpy as np
 
-from trainer.drivers.live import Reading, flawed
+from trainer.drivers.connected import flawed
+from trainer.drivers.live import Reading
 from trainer.drivers.plausible import FARTHEST_MM, is_rotation
 from trainer.drivers.serial_port import DeviceError
 from trainer.geometry import quaternion_from_matrix

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from trainer.config import ConfigError
-from trainer.drivers.live import Reading, flawed
+from trainer.drivers.connected import flawed
+from trainer.drivers.live import Reading
 from trainer.drivers.makers import failures, library
 from trainer.drivers.plausible import FARTHEST_MM, LENGTH_TOLERANCE
 from trainer.drivers.serial_port import DeviceError

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from trainer.drivers.connected import Connected
 from trainer.drivers.live import LivePoses, Reading, check_tools
 from trainer.drivers.makers import failures, library
 from trainer.drivers.serial_port import DeviceError
@@ -44,8 +45,8 @@ def open_spacemouse(
     hand = RateHand(spec, home.world_from_tool(tools.index(spec.tool)))
     moved = Tracked(name=spec.tool, tool=spec.tool)
     # The hand integrates in the world: nothing is left to place.
-    connect = partial(Cap, spec, hand)
-    return LivePoses("spacemouse", connect, Registration(), [moved], closure, tools, tick_hz, home)
+    open_cap = partial(Connected, "spacemouse", partial(Cap, spec, hand))
+    return LivePoses(open_cap, Registration(), [moved], closure, tools, tick_hz, home)
 
 
 class RateHand:

@@ -106,7 +106,7 @@ class Watch:
                 share, trouble = self._closure.closure(bird.tool, now)
                 closure = None if trouble else np.array([share])
             ok = np.array([not sample.flaw for sample in kept], dtype=bool)
-            found[f"bird{bird.address}"] = (bird.tool, seen(position, ok, closure, self._arrival(kept).lost or 0))
+            found[bird.name] = (bird.tool, seen(position, ok, closure, self._arrival(kept).lost or 0))
         return found
 
     def poses(self, address: int, seconds: float) -> tuple[Array, Array]:
