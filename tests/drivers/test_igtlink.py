@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -96,8 +97,7 @@ def test_a_profile_s_scale_anchor_and_tip_are_applied() -> None:
     )
     with talking(encode(IDENTITY)) as (port, say):
         driver = LivePoses(
-            "openigtlink",
-            lambda: Server(OpenigtlinkSpec(device=spec.device, port=port)),
+            partial(Connected, "openigtlink", partial(Server, replace(spec, port=port))),
             spec,
             spec.device,
             None,
@@ -206,7 +206,9 @@ def test_no_server_is_one_line() -> None:
 def test_a_device_that_moves_nothing_of_the_task_is_refused() -> None:
     spec = OpenigtlinkSpec(device=DEVICES)
     with pytest.raises(ConfigError, match="the device moves left, right; the task has third"):
-        LivePoses("openigtlink", lambda: Server(spec), spec, spec.device, None, ("third",), TICK_HZ, HOME)
+        LivePoses(
+            partial(Connected, "openigtlink", partial(Server, spec)), spec, spec.device, None, ("third",), TICK_HZ, HOME
+        )
 
 
 def test_a_poll_does_not_wait_for_a_silent_server() -> None:
@@ -215,7 +217,7 @@ def test_a_poll_does_not_wait_for_a_silent_server() -> None:
         polling = Polling(driver := opened(port))
         polling.until(lambda poses: polling.ticks >= 20)
         driver.close()
-    assert not driver._thread.is_alive()
+    assert "openigtlink" not in [thread.name for thread in threading.enumerate()]
 
 
 needs_pyigtl = pytest.mark.skipif(

@@ -41,7 +41,7 @@ class Line:
         self._rng = rng
         self._piece = piece
         self._waiting: deque[tuple[float, bytes]] = deque()  # when the last byte of each piece is out
-        self._late = b""  # what was due when the terminal was full
+        self._late = bytearray()  # what was due when the terminal was full
         self._free_s = 0.0  # when the line has sent what it was given
         self._master = self._slave = -1
         self.plug()
@@ -69,7 +69,7 @@ class Line:
         os.close(self._slave)
         self._master = self._slave = -1
         self._waiting.clear()
-        self._late = b""
+        self._late.clear()
 
     def read(self) -> bytes:
         """What the host has written; noise where its baud rate is another."""
@@ -107,7 +107,8 @@ class Line:
                 taken = os.write(self._master, self._late)
             except OSError:
                 taken = 0
-            self._late = self._late[taken:][: self._most_late]
+            del self._late[:taken]
+            del self._late[self._most_late :]
 
     def next_s(self) -> float:
         """When the next bytes are due; infinity where none wait."""
