@@ -163,7 +163,7 @@ def persistent(profile: Profile) -> Minibird:
 def test_a_power_cycle_and_an_unplugged_cable_are_survived(tmp_path: Path) -> None:
     """Power is off for 0.8 s of the clock's, the cable is out for 1.5 s (TRAINER_LONG: 5 s): the instruments are lost
     with the reason, the flock is configured anew, and they are back."""
-    faults = ("power-cycle=3:8", f"unplug=40:{(5 if os.environ.get('TRAINER_LONG') else 1.5) * SPEED:g}")
+    faults = ("power-cycle=3:8", f"unplug=25:{(5 if os.environ.get('TRAINER_LONG') else 1.5) * SPEED:g}")
     with simulated(tmp_path, *(a for f in faults for a in ("--fault", f))) as path:
         driver = opened(loaded(path))
         polling = Polling(driver)
@@ -187,7 +187,7 @@ def test_a_pause_and_another_hemisphere_freeze_without_a_restart(tmp_path: Path)
 
 
 def test_a_closure_sensor_that_says_nothing_or_nonsense_freezes_its_jaws(tmp_path: Path) -> None:
-    faults = ("closure:pause=3:4", "closure:out-of-range=10:4", "closure:unplug=17:6")
+    faults = ("closure:pause=2:4", "closure:out-of-range=8:3", "closure:unplug=13:4")
     with simulated(tmp_path, *(a for f in faults for a in ("--fault", f))) as path:
         driver = opened(loaded(path))
         polling = Polling(driver)
@@ -196,17 +196,23 @@ def test_a_closure_sensor_that_says_nothing_or_nonsense_freezes_its_jaws(tmp_pat
         driver.close()
 
 
-@pytest.mark.parametrize(
-    ("fault", "complaint"),
-    [
-        ("no-bird=2", "bird 2 is not there; check its power"),
-        ("garbage", r"bird 1 answers nothing|no tracker's answers|talks without end"),
-    ],
-)
-def test_a_flock_that_is_not_as_the_profile_says_is_one_line(tmp_path: Path, fault: str, complaint: str) -> None:
-    with simulated(tmp_path, "--fault", fault) as path, pytest.raises(DeviceError, match=complaint) as told:
-        opened(loaded(path))
+def test_what_is_no_flock_is_one_line(tmp_path: Path) -> None:
+    silences = replace(SHORT, answer_s=0.2)
+    complaint = r"bird 1 answers nothing|no tracker's answers|talks without end"
+    with simulated(tmp_path, "--fault", "garbage") as path, pytest.raises(DeviceError, match=complaint) as told:
+        opened(loaded(path), silences)
     assert str(told.value).startswith(str(tmp_path / "flock"))
+
+
+def test_a_missing_bird_and_another_baud_rate_are_one_line_each(tmp_path: Path) -> None:
+    """The baud rate at last: what the units hear may be half a command, of which they go on waiting for the rest."""
+    with simulated(tmp_path, "--fault", "no-bird=2") as path:
+        spec = spec_of(loaded(path))
+        with pytest.raises(DeviceError, match="bird 2 is not there; check its power") as told:
+            opened(loaded(path))
+        assert str(told.value).startswith(spec.port)
+        with pytest.raises(DeviceError, match="baud rate 9600"):
+            Flock(replace(spec, baud=9600), replace(SHORT, answer_s=0.2)).connect()
 
 
 def test_a_stream_that_never_starts_is_told_and_tried_again(tmp_path: Path) -> None:
@@ -217,12 +223,6 @@ def test_a_stream_that_never_starts_is_told_and_tried_again(tmp_path: Path) -> N
         polling.until(none_seen, lambda summary: summary["restarts"] >= 1)
         driver.close()
     assert said(polling.summary(), "bird 1 is silent")
-
-
-def test_a_wrong_baud_rate_is_one_line(tmp_path: Path) -> None:
-    """With a flock of its own: what it hears may be half a command, of which it goes on waiting for the rest."""
-    with simulated(tmp_path) as path, pytest.raises(DeviceError, match="baud rate 9600"):
-        Flock(replace(spec_of(loaded(path)), baud=9600), replace(SHORT, answer_s=0.2)).connect()
 
 
 def test_a_port_in_use_is_one_line(healthy: Profile) -> None:

@@ -50,6 +50,8 @@ class Faults:
 
     def spoil(self, data: bytes, rng: np.random.Generator) -> bytes:
         """``data`` as the line delivers it."""
+        if not (self.drop or self.flip or self.extra or self.burst or self.splice):
+            return data
         raw = np.frombuffer(data, dtype=np.uint8).copy()
         if self.flip:
             flips = rng.random((len(raw), 8)) < self.flip

@@ -10,7 +10,6 @@ import numpy as np
 from trainer.config import ConfigError
 from trainer.drivers import is_logged, sequence_file
 from trainer.geometry import Array, Rigid, quaternion_from_euler_deg, quaternion_multiply, slerp
-from trainer.log import reader
 from trainer.profile import Bird, MinibirdSpec
 
 #: Where sensors rest that nothing moves, mm from the transmitter along the hemisphere's axis (assumed).
@@ -105,6 +104,8 @@ def _resting(spec: MinibirdSpec, addresses: tuple[int, ...]) -> Hands:
 
 def _logged(motion: str, spec: MinibirdSpec, addresses: tuple[int, ...]) -> Hands:
     """A session's instruments as the sensors on them were, by the profile's mapping."""
+    from trainer.log import reader  # takes a while, and rest needs none
+
     path, _, session = motion.rpartition("#")
     with reader.open_log(Path(path)) as log:
         record = reader.load(log, session)
