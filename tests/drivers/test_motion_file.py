@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from tests.drivers.format_samples import FRAMES, SAMPLES, pose, put
 from trainer.config import ConfigError
-from trainer.drivers import PLAYED_BY, is_recording, motion_file
+from trainer.drivers import RECORDINGS, is_recording, motion_file
 from trainer.geometry import matrix_from_quaternion
 from trainer.motion import Motion
 
@@ -49,8 +49,8 @@ def test_the_same_motion_comes_out_of_every_format(end: str, tmp_path: Path) -> 
     assert track.ok[own].all()
 
 
-def test_every_reader_says_which_profile_plays_it() -> None:
-    assert set(PLAYED_BY) == set(motion_file.READERS)
+def test_what_can_be_read_is_a_recording_by_its_name() -> None:
+    assert set(RECORDINGS) == set(motion_file.READERS)
     assert all(is_recording(f"a{end}") for end in motion_file.READERS)
 
 

@@ -61,7 +61,7 @@ def test_the_older_spelling_of_time_is_read(tmp_path: Path) -> None:
 
 
 def test_devices_have_no_usual_names_so_a_profile_must_say_which_moves_what(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"which of its sensors moves what\? Write a profile"):
+    with pytest.raises(ConfigError, match=r"which of its sensors \(.+\) moves what\? Write a profile"):
         open_profile(str(put(tmp_path, ".xml", written())))
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.drivers.format_samples import SAMPLES, put
 from trainer.config import ConfigError
 from trainer.curriculum import Task, load_task
 from trainer.drivers import open_driver, open_profile, recording
@@ -246,7 +247,7 @@ def test_a_summary_counts_the_frames_that_were_played(tmp_path: Path, task: Task
 
 
 def test_a_recording_s_path_becomes_a_profile_whose_text_says_all(tmp_path: Path) -> None:
-    path = str(tmp_path / 'odd "name" \\ é.seq.mha')
+    path = str(put(tmp_path, 'odd "name" \\ é.seq.mha', SAMPLES[".igs.mha"][0]))
     file = open_profile(path)
     assert file.profile.name == "plus-sequence"
     assert file.profile.recording is not None

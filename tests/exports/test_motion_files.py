@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from tests.drivers.format_samples import SAMPLES, put
 from tests.metrics.synthetic_session import performed, task_of
-from trainer.drivers import motion_file, open_driver
+from trainer.config import ConfigError
+from trainer.drivers import motion_file, open_driver, open_profile
 from trainer.exports.csv_files import write as write_csv
 from trainer.exports.files import ExportError
 from trainer.exports.motion_files import WRITERS, of_session, write_sequence, write_table
@@ -137,16 +138,17 @@ def test_a_sensor_that_a_key_cannot_name_is_refused_and_kept_in_a_table(tmp_path
     assert motion_file.read(tmp_path / "a.csv").sensors == ["left hand"]
 
 
-def test_a_session_s_table_moves_the_instruments_as_they_moved(tmp_path: Path) -> None:
-    """Tick upon tick, jaws and what was not seen included.
+@each_writer
+def test_an_exported_session_moves_the_instruments_as_they_moved(end: str, tmp_path: Path) -> None:
+    """Tick upon tick, jaws and what was not seen included; the names of its sensors say which is which.
 
     A tick's time and its sample's differ by the rounding of a time below 100 s, 1e-14, at speeds of 100 mm/s at most; a
     rotation passes a slerp and two products.
     """
     session = performed(seed=6)
     session.valid[7:9, 1] = False
-    write_csv([session], tmp_path / "out")
-    path = tmp_path / "out" / "poses.csv"
+    path = tmp_path / f"session{end}"
+    WRITERS[end](of_session(session), path)
     task = task_of()
     tools = [instrument.tool for instrument in task.scene.instrument]
     waiting = ToolPoses(np.zeros((2, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)), np.zeros(2), np.ones(2, dtype=bool))
@@ -164,6 +166,43 @@ def test_a_session_s_table_moves_the_instruments_as_they_moved(tmp_path: Path) -
     wanted = matrix_from_quaternion(session.quaternion[:, columns])
     np.testing.assert_allclose(turned[seen], wanted[seen], rtol=0, atol=1e-11)
     np.testing.assert_allclose(closure, session.closure[:, columns], rtol=0, atol=1e-11)
+
+
+@each_writer
+def test_an_instrument_that_a_file_does_not_have_stays_where_it_waits(end: str, tmp_path: Path) -> None:
+    motion = of_session(performed(seed=6))
+    path = tmp_path / f"right{end}"
+    WRITERS[end](Motion("right", motion.time, motion.frame_number, {"right": motion.tracks["right"]}), path)
+    task = task_of()
+    tools = [instrument.tool for instrument in task.scene.instrument]
+    waiting = ToolPoses(np.zeros((2, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)), np.zeros(2), np.ones(2, dtype=bool))
+    _, driver = open_driver(str(path), task, waiting, seed=0)
+    poses = driver.poll(0, None)
+    assert poses is not None
+    assert driver.summary()["sensors"] == {"right": "right"}
+    assert poses.position[tools.index("left")].tolist() == [0.0, 0.0, 0.0]
+    assert poses.position[tools.index("right")].any()
+
+
+@each_writer
+def test_a_file_written_again_is_played_by_the_names_of_its_sensors(end: str, tmp_path: Path) -> None:
+    for start, player in ((".txt", "jigsaws"), (".igs.mha", "plus-sequence")):
+        motion = motion_file.read(put(tmp_path, start, SAMPLES[start][0]))
+        path = tmp_path / f"{player}{end}"
+        WRITERS[end](motion, path)
+        assert open_profile(str(path)).profile.name == player
+
+
+@each_writer
+def test_sensors_that_no_profile_knows_are_named_in_one_line(end: str, tmp_path: Path) -> None:
+    motion = of_session(performed(seed=6))
+    path = tmp_path / f"foreign{end}"
+    WRITERS[end](
+        Motion("x", motion.time, motion.frame_number, dict(zip("AB", motion.tracks.values(), strict=True))), path
+    )
+    with pytest.raises(ConfigError, match=r"which of its sensors \(A, B\) moves what\? Write a profile") as caught:
+        open_profile(str(path))
+    assert str(caught.value).startswith(f"{path}: ")
 
 
 @pytest.mark.skipif(not REAL.exists(), reason=f"the real recording {REAL.name} is not beside the checkout")

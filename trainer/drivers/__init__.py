@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -11,19 +12,17 @@ from trainer.config import ConfigError
 from trainer.curriculum import Task
 from trainer.drivers.driver import Driver
 from trainer.poses import ToolPoses
-from trainer.profile import Hand, Profile, ProfileFile, load_profile, parse_profile
+from trainer.profile import Hand, Profile, ProfileFile, RecordingSpec, load_profile, parse_profile
 
 __all__ = ["Driver", "is_logged", "is_recording", "open_driver", "open_profile", "recording_path", "scripted_hands"]
 
 
-#: By the end of a recording's name: the shipped profile that plays it; None where sensors have no usual names.
-PLAYED_BY: dict[str, str | None] = {
-    ".mha": "plus-sequence",
-    ".nrrd": "plus-sequence",
-    ".txt": "jigsaws",
-    ".csv": "pose-table",
-    ".xml": None,
-}
+#: How the names of recordings end.
+RECORDINGS = (".mha", ".nrrd", ".txt", ".csv", ".xml")
+#: Shipped profiles of recordings; a file is played by the first one whose sensors it has, in whatever format it is.
+PLAYERS = ("plus-sequence", "jigsaws")
+#: The shipped profile whose sensors are called as the instruments are, as in what we export; it takes those it finds.
+PLAYER_OF_TOOLS = "pose-table"
 
 
 def is_logged(reference: str) -> bool:
@@ -34,7 +33,7 @@ def is_logged(reference: str) -> bool:
 
 def is_recording(reference: str) -> bool:
     """Whether ``reference`` names a recording (``*.mha``, ``*.csv`` …, ``PATH.db#SESSION``) and not a profile."""
-    return Path(reference).suffix.lower() in PLAYED_BY or is_logged(reference)
+    return Path(reference).suffix.lower() in RECORDINGS or is_logged(reference)
 
 
 def open_profile(reference: str) -> ProfileFile:
@@ -44,17 +43,39 @@ def open_profile(reference: str) -> ProfileFile:
     """
     if not is_recording(reference):
         if Path(reference).is_file() and Path(reference).suffix != ".toml":
-            known = ", ".join(PLAYED_BY)
+            known = ", ".join(RECORDINGS)
             raise ConfigError(f"{reference}: neither a profile (.toml) nor a recording by its name ({known})")
         return load_profile(reference)
-    name = "logged-session" if is_logged(reference) else PLAYED_BY[Path(reference).suffix.lower()]
-    if name is None:
-        raise ConfigError(
-            f"{reference}: which of its sensors moves what? Write a profile that says so (devices/README.md)"
-        )
-    template = load_profile(name)
-    text = template.text.replace('path = ""', f"path = {json.dumps(reference, ensure_ascii=False)}", 1)
+    template = load_profile("logged-session").text if is_logged(reference) else _player(reference)
+    text = template.replace('path = ""', f"path = {json.dumps(reference, ensure_ascii=False)}", 1)
     return ProfileFile(path=reference, text=text, profile=parse_profile(text, reference))
+
+
+def _player(path: str) -> str:
+    """The text of the shipped profile that plays a recording, by the names of its sensors. Raises ConfigError."""
+    from trainer.drivers.motion_file import read
+
+    sensors = read(path).sensors
+    for name in PLAYERS:
+        player = load_profile(name)
+        if player.profile.recording is not None and _names(player.profile.recording) <= set(sensors):
+            return player.text
+    player = load_profile(PLAYER_OF_TOOLS)
+    assert player.profile.recording is not None
+    wanted = _names(player.profile.recording)
+    if not wanted & set(sensors):
+        raise ConfigError(
+            f"{path}: which of its sensors ({', '.join(sensors)}) moves what? Write a profile that says so "
+            "(devices/README.md)"
+        )
+    text = player.text
+    for missing in wanted.difference(sensors):
+        text = re.sub(rf'(?m)^\[\[recording\.sensor\]\]\nname = "{missing}"\n(?:(?!\[).*\n)*', "", text)
+    return text
+
+
+def _names(spec: RecordingSpec) -> set[str]:
+    return {sensor.name for sensor in spec.sensor}
 
 
 def recording_path(file: ProfileFile) -> str:
