@@ -52,6 +52,7 @@ def test_the_largest_seed_is_taken() -> None:
 FLOCK = 'name = "x"\ndriver = "minibird"\nsummary = "x"\n[minibird]\n'
 BIRDS = "".join(f'[[minibird.bird]]\naddress = {a}\ntool = "{t}"\n' for a, t in ((1, "left"), (2, "right")))
 CLOSURE = '[closure]\nport = "c"\n[[closure.jaw]]\ntool = "left"\nopen = 100\nclosed = 105\n'
+JAWS = CLOSURE.replace("105", "805")
 
 
 @pytest.mark.parametrize(
@@ -65,6 +66,16 @@ CLOSURE = '[closure]\nport = "c"\n[[closure.jaw]]\ntool = "left"\nopen = 100\ncl
         (FLOCK + 'port = "p"\n' + BIRDS.replace("2", "15"), r"'minibird\.bird\[1\]\.address' must be >= 1 and <= 14"),
         (FLOCK + 'port = "p"\nrate_hz = 200\n' + BIRDS, r"'minibird\.rate_hz' must be >= 20 and <= 144, found 200"),
         (FLOCK + 'port = "p"\n' + BIRDS + CLOSURE, "'open' and 'closed' must be at least 10 counts apart"),
+        (FLOCK + BIRDS.replace("tool", 'port = "p"\ntool'), "two birds have the same port; in group mode give it to"),
+        (FLOCK + 'port = "p"\nrate_hz = nan\n' + BIRDS, "'minibird.rate_hz' "),
+        (FLOCK + 'port = "p"\nhemisphere = "-forward"\n' + BIRDS, "'minibird.hemisphere' "),
+        (FLOCK + 'port = "p"\nbaud = 300\n' + BIRDS, "'minibird.baud' must be >= 2400"),
+        (FLOCK + 'port = "c"\n' + BIRDS + JAWS, "tracker and closure sensor have the same port 'c'"),
+        (FLOCK + 'port = "p"\n' + BIRDS + JAWS.replace('"c"', '""'), "'port' is empty; give the board's"),
+        (
+            FLOCK + 'port = "p"\n' + BIRDS + JAWS + JAWS.partition("\n")[2].partition("\n")[2],
+            "one table .* for each tool",
+        ),
     ],
 )
 def test_a_flock_that_cannot_be_is_refused_in_one_line(text: str, message: str) -> None:

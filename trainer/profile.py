@@ -123,8 +123,10 @@ class MinibirdSpec(Registration):
             if len(set(found)) < len(found):
                 raise ValueError(f"two birds have the same {what}")
         own = [bird.port for bird in self.bird]
-        if any(own) and (not all(own) or len(set(own)) < len(own)):
+        if any(own) and not all(own):
             raise ValueError("either each bird has a port of its own, or none has one")
+        if all(own) and len(set(own)) < len(own):
+            raise ValueError("two birds have the same port; in group mode give it to [minibird] instead")
         if any(own) == bool(self.port):
             raise ValueError("give 'port' for the flock in group mode, or a port to each bird")
 
@@ -149,6 +151,12 @@ class ClosureSpec:
     port: str
     jaw: tuple[Jaw, ...]
     baud: int = field(default=115200, metadata={"bounds": Bounds(2400, 4_000_000)})
+
+    def __post_init__(self) -> None:
+        if not self.port:
+            raise ValueError("'port' is empty; give the board's")
+        if not self.jaw or len({jaw.tool for jaw in self.jaw}) < len(self.jaw):
+            raise ValueError("a board needs one table [[closure.jaw]] for each tool that it measures")
 
 
 @dataclass(frozen=True)
@@ -250,6 +258,11 @@ class Profile:
         wanted = "hand" if self.driver == "scripted" else self.driver
         if getattr(self, wanted) is None:
             raise ValueError(f"driver '{self.driver}' needs a table [{wanted}]")
+        trackers = [self.ndi.port] if self.ndi is not None else []
+        if self.minibird is not None:
+            trackers += [self.minibird.port, *(bird.port for bird in self.minibird.bird)]
+        if self.closure is not None and self.closure.port in trackers:
+            raise ValueError(f"tracker and closure sensor have the same port '{self.closure.port}'")
 
 
 @dataclass(frozen=True)

@@ -236,7 +236,7 @@ def test_a_port_in_use_is_one_line(healthy: Profile) -> None:
     [
         ("{folder}/nothing", "no such port; plug the device in"),
         ("nonsense://here", "cannot be opened"),
-        ("socket://127.0.0.1:{unused}", "cannot be opened"),
+        ("socket://127.0.0.1:{unused}", "nobody answers there; start what serves the port"),
     ],
 )
 def test_a_port_that_is_not_there_is_one_line(tmp_path: Path, healthy: Profile, port: str, complaint: str) -> None:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import serial
 
 from trainer.drivers import minibird_commands as commands
 from trainer.drivers.minibird_record import WORDS, RecordParser, decode
@@ -56,6 +57,7 @@ class Flock:
         self._master = 1 if spec.port else self._addresses[0]
         self._urls = {b.address: b.port for b in spec.bird} if not spec.port else {self._master: spec.port}
         self._ports: dict[int, Any] = {}  # by the address of the unit that is plugged in there
+        self._at = self._master  # at whose port something was said last
         group = bool(spec.port)
         everyone = tuple(range(1, self._addresses[-1] + 1))
         #: Of what comes at each port. They last as long as the flock: where a bird was before a loss tells whether it
@@ -91,7 +93,9 @@ class Flock:
             self._check_error()
         except OSError as error:
             self.disconnect()
-            raise DeviceError(f"{self._url}: the port is gone: {error.strerror or error}") from None
+            slow = isinstance(error, serial.SerialTimeoutException)
+            why = "takes no bytes; is it the tracker's?" if slow else "the port is gone; plug it in again"
+            raise DeviceError(f"{self._urls[self._at]}: {why}") from None
         except BaseException:
             self.disconnect()
             raise
@@ -123,7 +127,8 @@ class Flock:
     def _say(self, address: int, command: bytes) -> None:
         """To the unit at a port of its own, or by its prefix through the master's."""
         own = address in self._ports
-        self._ports[address if own else self._master].write(commands.to_bird(None if own else address, command))
+        self._at = address if own else self._master
+        self._ports[self._at].write(commands.to_bird(None if own else address, command))
 
     def _ask(self, address: int, command: bytes, count: int) -> bytes:
         """The answer of ``count`` bytes, asked for again where bytes of it are lost. Raises DeviceError."""

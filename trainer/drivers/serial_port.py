@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import re
+import socket
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -46,7 +47,7 @@ def open_port(url: str, baud: int) -> Any:
             port.exclusive = True
         port.open()
     except REFUSALS as error:
-        raise DeviceError(f"{url}: {_why(error)}") from None
+        raise DeviceError(f"{url}: {_why(url, error)}") from None
     _hand_over_at_once(port)
     return port
 
@@ -71,15 +72,33 @@ def _hand_over_at_once(port: Any) -> None:
             ask(True)
 
 
-def _why(error: Exception) -> str:
-    number = error.args[0] if error.args else None
+def _why(url: str, error: Exception) -> str:
+    """What is wrong with a port, and what to do: pyserial puts words of its own around what the system said."""
+    said = error.__context__ or error
+    number = said.args[0] if said.args else None
     if "exclusively lock" in str(error) or number in (errno.EBUSY, errno.EAGAIN):
         return "in use by another program; end that one first"
+    if isinstance(said, OSError) and url.startswith("spy://") and said.filename not in (None, _device(url)):
+        return f"its log of bytes cannot be written: {said.filename}: {said.strerror}"
+    if isinstance(said, (ConnectionRefusedError, TimeoutError)):
+        return "nobody answers there; start what serves the port, or correct the profile"
+    if isinstance(said, socket.gaierror):
+        return "no such host; correct the profile"
     if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.EIO):
         return "no such port; plug the device in, or give the profile its port"
     if number in (errno.EACCES, errno.EPERM):
         return "not allowed; on Linux join the group 'dialout' and log in again"
-    return f"cannot be opened: {' '.join(str(error).split())}"
+    if number in (errno.EISDIR, errno.ENOTDIR, errno.ENOTTY, errno.EINVAL):
+        return "no serial port; give the profile its port"
+    if str(error).startswith("Remote"):
+        return "what answers there does not speak RFC 2217; give socket:// to a plain connection"
+    why = said.strerror if isinstance(said, OSError) and said.strerror else str(said)
+    return f"cannot be opened: {' '.join(why.split())}"
+
+
+def _device(url: str) -> str:
+    """The port inside of an address that writes a log."""
+    return url.removeprefix("spy://").partition("?")[0]
 
 
 def set_reset(port: Any, held: bool) -> None:
