@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import re
 import socket
 import sys
@@ -36,6 +37,7 @@ def open_port(url: str, baud: int) -> Any:
     RTS low lets a tracker run and high holds it in reset, DTR low stops its output: both are set before the port is
     opened, since pyserial would raise both. A pseudo-terminal has neither line; setting them before is no error there.
     """
+    port: Any = None
     try:
         if url.startswith(("socket://", "rfc2217://")) and urlsplit(url).port is None:
             raise ValueError("its address has no port; give host:port")
@@ -47,6 +49,7 @@ def open_port(url: str, baud: int) -> Any:
             port.exclusive = True
         port.open()
     except REFUSALS as error:
+        _forget_log(port)
         raise DeviceError(f"{url}: {_why(url, error)}") from None
     _hand_over_at_once(port)
     return port
@@ -62,6 +65,15 @@ def _fresh_log(url: str) -> str:
         count += 1
         log = f"{found[2]}.{count}"
     return f"{found[1]}{log}{found[3]}"
+
+
+def _forget_log(port: Any) -> None:
+    """A port that could not be opened leaves an open and empty log of bytes behind, one each time it is tried."""
+    log = getattr(getattr(port, "formatter", None), "output", None)
+    if isinstance(log, io.FileIO):
+        log.close()
+        if Path(log.name).is_file():
+            Path(log.name).unlink()
 
 
 def _hand_over_at_once(port: Any) -> None:
