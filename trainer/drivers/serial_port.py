@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import io
 import re
 import socket
 import sys
@@ -70,7 +69,7 @@ def _fresh_log(url: str) -> str:
 def _forget_log(port: Any) -> None:
     """A port that could not be opened leaves an open and empty log of bytes behind, one each time it is tried."""
     log = getattr(getattr(port, "formatter", None), "output", None)
-    if isinstance(log, io.FileIO):
+    if log is not None and log is not sys.stderr:
         log.close()
         if Path(log.name).is_file():
             Path(log.name).unlink()
