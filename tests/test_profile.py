@@ -73,7 +73,7 @@ JAWS = CLOSURE.replace("105", "805")
         (FLOCK + 'port = "c"\n' + BIRDS + JAWS, "tracker and closure sensor have the same port 'c'"),
         (FLOCK + 'port = "p"\n' + BIRDS + JAWS.replace('"c"', '""'), "'port' is empty; give the board's"),
         (
-            FLOCK + 'port = "p"\n' + BIRDS + JAWS + JAWS.partition("\n")[2].partition("\n")[2],
+            FLOCK + 'port = "p"\n' + BIRDS + JAWS + JAWS[JAWS.index("[[") :],
             "one table .* for each tool",
         ),
     ],

@@ -60,8 +60,8 @@ def test_an_address_without_a_port_is_one_line() -> None:
         ("{folder}", "no serial port; give the profile its port"),
         ("/dev/null", "no serial port; give the profile its port"),
         (
-            "spy://{tty}?file={folder}/no/log.txt",
-            "its log of bytes cannot be written: {folder}/no/log.txt: No such file",
+            "spy://{tty}?file={folder}/no/log",
+            "its log of bytes cannot be written: {folder}/no/log: No such file",
         ),
         ("spy:///dev/nothing?file={folder}/log.txt", "no such port; plug the device in"),
         ("socket://nowhere.invalid:1", "no such host; correct the profile"),
@@ -82,6 +82,7 @@ def test_what_is_wrong_with_a_port_is_said_in_our_words(tmp_path: Path, port: st
     os.close(slave)
     assert str(told.value).startswith(f"{port.format(**names)}: {complaint.format(**names)}")
     assert "Errno" not in str(told.value)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]  # no empty log is left behind
     assert "\n" not in str(told.value)
 
 
@@ -100,6 +101,6 @@ def test_a_port_of_somebody_else_and_one_in_use_say_what_to_do(monkeypatch: pyte
     with monkeypatch.context() as patched:
         patched.setattr("serial.serialposix.os.open", refused)
         with pytest.raises(DeviceError, match="not allowed; on Linux join the group 'dialout' and log in again"):
-            open_port(os.ttyname(slave), 9600)
+            open_port(port, 9600)
     os.close(master)
     os.close(slave)
