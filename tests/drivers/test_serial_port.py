@@ -89,11 +89,9 @@ def test_what_is_wrong_with_a_port_is_said_in_our_words(tmp_path: Path, port: st
 def test_a_port_of_somebody_else_and_one_in_use_say_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whoever runs the tests may be allowed everything: the system's answer is given for it."""
     master, slave = os.openpty()
-    with (
-        serial.Serial(os.ttyname(slave), exclusive=True),
-        pytest.raises(DeviceError, match="in use by another program"),
-    ):
-        open_port(os.ttyname(slave), 9600)
+    port = os.ttyname(slave)
+    with serial.Serial(port, exclusive=True), pytest.raises(DeviceError, match="in use by another program"):
+        open_port(port, 9600)
 
     def refused(*told: object) -> None:
         raise PermissionError(13, "Permission denied")
