@@ -64,10 +64,17 @@ def test_a_device_in_the_hand_is_monitored(
             assert text in out
 
 
-def test_what_is_wrong_stands_below_the_table(command_line: CommandLine, tmp_path: Path) -> None:
+def test_a_device_of_which_nothing_comes_is_shown_and_is_a_failure(command_line: CommandLine, tmp_path: Path) -> None:
+    """The table or the document is complete, what is wrong stands below it and on stderr, in one line."""
+    complaint = "trainer: device 'minibird-pair': no record came; bird 1 is silent\n"
     with simulated(tmp_path, "--fault", "mute") as profile:
-        _, out, _ = command_line("devices", "monitor", profile, "--seconds", "0.9")
-    assert "bird 1 is silent" in out
+        code, out, err = command_line("devices", "monitor", profile, "--seconds", "0.9")
+        assert (code, err) == (1, complaint)
+        assert "bird 1 is silent" in out
+        code, out, err = command_line("devices", "monitor", profile, "--seconds", "0.9", "--json")
+    assert (code, err) == (1, complaint)
+    got = json.loads(out)
+    assert (got["records"], got["flaws"], got["trouble"]) == (0, {}, "bird 1 is silent")
 
 
 def swept(path: Path) -> None:

@@ -147,6 +147,40 @@ def test_an_existing_recording_is_not_overwritten(command_line: CommandLine, tas
     assert not (tmp_path / "log.db").exists()
 
 
+@pytest.mark.parametrize(
+    ("record", "complaint"),
+    [
+        ("file/x.rrd", "{folder}/file is a file, not a folder"),
+        ("file/deeper/x.rrd", "{folder}/file is a file, not a folder"),
+        ("folder.rrd", "is a folder, not a file"),
+    ],
+)
+def test_where_no_recording_can_be_is_one_line_that_names_it(
+    command_line: CommandLine, task: Path, tmp_path: Path, record: str, complaint: str
+) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "folder.rrd").mkdir()
+    log = tmp_path / "log.db"
+    code, out, err = command_line("practice", task, "--fast", "--db", log, "--record", tmp_path / record)
+    assert (code, out) == (1, "")
+    complaint = complaint.format(folder=tmp_path)
+    assert err == f"trainer: {tmp_path / record}: {complaint}; give --record another place, or --no-record\n"
+    assert not log.exists()
+
+
+def test_where_no_log_can_be_is_one_line_that_names_it(command_line: CommandLine, task: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for db, complaint in (
+        ("file/x.db", f"{tmp_path / 'file'} is a file, not a folder"),
+        ("", "is a folder, not a file"),
+    ):
+        code, out, err = command_line("practice", task, "--fast", "--no-record", "--db", tmp_path / db)
+        assert (code, out, err) == (1, "", f"trainer: {tmp_path / db}: {complaint}; name another log\n")
+    deep = tmp_path / "new" / "folders" / "log.db"
+    assert command_line("practice", task, "--fast", "--no-record", "--db", deep)[0] == 0
+    assert deep.is_file()
+
+
 REFUSED = [
     (["anastomosis/nothing"], "unknown task 'anastomosis/nothing'; known: "),
     (["anastomosis/single-stitch", "--device", "nobody"], "unknown device profile 'nobody'; known: "),

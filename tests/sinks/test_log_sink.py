@@ -363,5 +363,5 @@ def test_an_unwritable_folder_is_told_in_one_line() -> None:
     lines = output.splitlines()
     assert [line.split(": ")[0] for line in lines] == list(map(str, places)), errors
     assert "cannot be written" in lines[0]
-    assert "unable to open" in lines[1]
+    assert "may not be written to; name another log" in lines[1]
     assert "Permission denied" in lines[2]

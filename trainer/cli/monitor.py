@@ -23,7 +23,7 @@ def show(reference: str, seconds: float | None, as_json: bool) -> None:
     """Show how records arrive: of a live device until ``seconds`` are over or Ctrl-C, of a recording at its own pace.
 
     ``--json`` waits for a live device only. Raises ConfigError for a device that neither has records nor plays a
-    recording, DeviceError for one that does not answer.
+    recording, DeviceError for one that does not answer, or of which nothing comes, when that is shown.
     """
     from trainer import drivers
     from trainer.config import ConfigError
@@ -81,6 +81,8 @@ def _watch(profile: Profile, seconds: float | None, as_json: bool) -> None:
     from rich.console import Console
     from rich.live import Live
 
+    from trainer.drivers.minibird_record import DROPPED
+    from trainer.drivers.serial_port import DeviceError
     from trainer.drivers.watch import Watch
     from trainer.session import interruptible
 
@@ -97,6 +99,10 @@ def _watch(profile: Profile, seconds: float | None, as_json: bool) -> None:
         print(json.dumps(report, indent=2))
     else:
         Console().print(_table(report))
+    if not set(report["flaws"]) - {DROPPED}:
+        raise DeviceError(
+            f"device '{profile.name}': no record came; {report['trouble'] or 'the stream does not start'}"
+        )
 
 
 def _seen_live(profile: Profile, device: Watch) -> dict[str, Any]:

@@ -239,12 +239,14 @@ def versions() -> dict[str, str]:
 
 
 def _make_room(recording: Path) -> None:
-    """Make the folder of a recording. Raises ConfigError where a recording is there already, and OSError."""
+    """Make the folder of a recording. Raises ConfigError where there cannot be one, or a recording is there already."""
     from trainer.config import ConfigError
+    from trainer.log.schema import unwritable
 
-    if recording.exists():
+    if recording.exists() and not recording.is_dir():
         raise ConfigError(f"{recording}: exists already; give --record another name, or remove it")
-    recording.parent.mkdir(parents=True, exist_ok=True)
+    if why := unwritable(recording):
+        raise ConfigError(f"{recording}: {why}; give --record another place, or --no-record")
 
 
 def _close_interrupted(log_path: Path) -> None:

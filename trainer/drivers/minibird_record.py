@@ -28,6 +28,8 @@ WORDS = 7
 #: mm of one unit of a position word at a full scale of 36 inches.
 POSITION_MM = 36.0 * 25.4 / 32768.0
 
+#: What bytes that belong to no record are counted as.
+DROPPED = "dropped bytes"
 # Why a sample is not to be trusted.
 RESYNC = "first after dropped bytes"
 ADDRESS = "unknown address"
@@ -138,7 +140,7 @@ class RecordParser:
 
     def _drop(self, count: int) -> None:
         if count:
-            self.counts["dropped bytes"] += count
+            self.counts[DROPPED] += count
             self._dropped = True
 
     def _sample(self, record: bytes, time_s: float) -> Sample:

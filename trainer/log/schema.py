@@ -110,10 +110,27 @@ def new_session_id() -> str:
 def create_log(path: Path) -> Database:
     """The log at ``path``, made (with its folder) where there is none. Raises LogError."""
     with clear_errors(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if path.exists() and not can_write(path):
+        if path.is_file() and not can_write(path):
             raise LogError(f"{path}: cannot be written; make the file and its folder writable, or name another log")
+        if why := unwritable(path):
+            raise LogError(f"{path}: {why}; name another log")
         return _connected(path, _make_tables)
+
+
+def unwritable(path: Path) -> str:
+    """Why no file can be made at ``path``, whose folder is made where there is none; "" where one can."""
+    if path.is_dir():
+        return "is a folder, not a file"
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        blocked = next(folder for folder in path.parents if folder.exists())
+        return f"{blocked} is a file, not a folder"
+    except OSError as error:
+        return f"its folder cannot be made: {error.strerror}"
+    if not os.access(path.parent, os.W_OK | os.X_OK):
+        return f"its folder {path.parent} may not be written to"
+    return ""
 
 
 def can_write(path: Path) -> bool:
@@ -180,6 +197,8 @@ def _reason(error: sqlite3.Error) -> str:
         return "the disk is full"
     if name.startswith("SQLITE_IOERR"):
         return "the disk refuses to write or read (full, over quota or gone)"
+    if name.startswith("SQLITE_CANTOPEN"):
+        return "cannot be made or opened here; name another log"
     if name.startswith("SQLITE_NOTADB"):
         return "not a log: not an SQLite file"
     if name.startswith("SQLITE_CORRUPT"):
