@@ -153,7 +153,7 @@ class ClosureSpec:
     baud: int = field(default=115200, metadata={"bounds": Bounds(2400, 4_000_000)})
 
     def __post_init__(self) -> None:
-        if not self.port:
+        if not self.port.strip():
             raise ValueError("'port' is empty; give the board's")
         if not self.jaw or len({jaw.tool for jaw in self.jaw}) < len(self.jaw):
             raise ValueError("a board needs one table [[closure.jaw]] for each tool that it measures")

@@ -92,14 +92,18 @@ def simulate(
     trackers, closures = faults.parse(fault or [])
     hands = open_hands(motion, spec)
     out = out.absolute()
-    out.mkdir(parents=True, exist_ok=True)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        raise ConfigError(f"{out}: there is a file where a folder should be; give --out another name") from None
     ports = [out / "flock"] if spec.port else [out / bird.name for bird in spec.bird]
     ports += [out / "closure"] if closure is not None else []
     written = out / f"{file.profile.name}.toml"
     if written.exists() and file.path.endswith(".toml") and written.samefile(file.path):
         raise ConfigError(f"{written}: is the profile itself; give --out another folder")
-    station = Station(spec, closure, hands, ports, speed, trackers, closures, seed)
-    written.write_text(with_ports(file.text, ports, hands.in_scene), encoding="utf-8")
+    for port in ports:
+        if port.exists():
+            raise ConfigError(f"{port}: is there already; another simulation plays there, or remove it")
     ended = False
 
     def end(signum: int, frame: FrameType | None) -> None:
@@ -108,6 +112,8 @@ def simulate(
 
     signal.signal(signal.SIGINT, end)
     signal.signal(signal.SIGTERM, end)
+    station = Station(spec, closure, hands, ports, speed, trackers, closures, seed)
+    written.write_text(with_ports(file.text, ports, hands.in_scene), encoding="utf-8")
     print(written, flush=True)
     print(json.dumps(station.run(lambda: ended)), flush=True)
 
