@@ -28,7 +28,7 @@ from trainer.drivers.minibird_flock import UNHURRIED, Flock, Silences
 from trainer.drivers.minibird_record import MIRROR, Sample
 from trainer.drivers.serial_port import DeviceError, read_some
 from trainer.poses import ToolPoses
-from trainer.profile import MinibirdSpec, Profile
+from trainer.profile import Bird, MinibirdSpec, Profile
 from trainer.simulators.faults import Faults, Span, parse
 
 REAL = Path(__file__).parents[3] / "shared/data/tracker/WaterTankBottomTranslationTrackerBuffer.igs.mha"
@@ -247,6 +247,31 @@ def test_a_port_that_is_not_there_is_one_line(tmp_path: Path, healthy: Profile, 
             Flock(replace(spec_of(healthy), port=url), SHORT).connect()
     assert str(told.value).startswith(url)
     assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("port", "complaint"),
+    [("{tty}", "the port is gone; plug it in again"), ("spy://{tty}?file=/dev/full", "its log .* the disk is full")],
+)
+def test_what_fails_while_connecting_is_one_line(port: str, complaint: str) -> None:
+    """A plug that is pulled out during the silence after opening, and a full disk. /dev/full is Linux's."""
+    master, slave = os.openpty()
+    url = port.format(tty=os.ttyname(slave))
+    os.close(slave)
+    if "/dev/full" in url and not Path("/dev/full").exists():
+        pytest.skip("no /dev/full here")
+    open_ends = [master]
+
+    def pause(seconds: float) -> None:
+        if "/dev/full" not in url and open_ends:
+            os.close(open_ends.pop())
+
+    spec = MinibirdSpec(bird=(Bird(address=1, tool="left"),), port=url)
+    with pytest.raises(DeviceError, match=f": {complaint}$") as told:
+        Flock(spec, SHORT, pause).connect()
+    assert str(told.value).startswith(url)
+    for end in open_ends:
+        os.close(end)
 
 
 def test_a_flock_behind_a_socket_is_a_flock(healthy: Profile) -> None:

@@ -5,6 +5,7 @@ Start sequence and silences: Ascension, Flock of Birds Installation and Operatio
 
 from __future__ import annotations
 
+import errno
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -93,8 +94,11 @@ class Flock:
             self._check_error()
         except OSError as error:
             self.disconnect()
-            slow = isinstance(error, serial.SerialTimeoutException)
-            why = "takes no bytes; is it the tracker's?" if slow else "the port is gone; plug it in again"
+            why = "the port is gone; plug it in again"
+            if isinstance(error, serial.SerialTimeoutException):
+                why = "takes no bytes; is it the tracker's?"
+            elif error.errno == errno.ENOSPC:  # of spy://
+                why = "its log of bytes cannot be written: the disk is full"
             raise DeviceError(f"{self._urls[self._at]}: {why}") from None
         except BaseException:
             self.disconnect()
