@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from conftest import CommandLine
 from typer.testing import CliRunner
 
 from trainer import serial_ports
@@ -163,3 +164,19 @@ def test_a_file_that_is_neither_profile_nor_recording_is_told_so(
     assert (code, out) == (1, "")
     assert err.count("\n") == 1
     assert "neither a profile (.toml) nor a recording by its name (.mha, " in err
+
+
+@pytest.mark.parametrize("there", ["flock", "closure"])
+def test_a_simulation_leaves_alone_what_lies_where_its_ports_would_be(
+    command_line: CommandLine, tmp_path: Path, there: str
+) -> None:
+    """Such as the ports of another simulation, which its programs are still talking to."""
+    (tmp_path / there).write_text("somebody's")
+    code, out, err = command_line("devices", "simulate", "minibird-pair", "--out", tmp_path)
+    assert (code, out) == (1, "")
+    assert err == f"trainer: {tmp_path / there}: is there already; another simulation plays there, or remove it\n"
+    assert [path.name for path in tmp_path.iterdir()] == [there]
+    assert (tmp_path / there).read_text() == "somebody's"
+    code, _, err = command_line("devices", "simulate", "minibird-pair", "--out", tmp_path / there)
+    assert (code, err.count("\n")) == (1, 1)
+    assert "there is a file where a folder should be; give --out another name" in err
