@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from volume_samples import SPACING, block, check_structure, cut_some, material, random_shape, seeds, worst_violation
 
+from trainer.mechanics.chainmail import widen
 from trainer.mechanics.chainmail_scan import RUN
 from trainer.mechanics.volume import FREE, Volume, VolumeError, VolumeState, build, places, start, tack
 from trainer.mechanics.volume_drag import drag
@@ -49,6 +50,24 @@ def test_a_bar_stretches_link_by_link_to_its_limit(method: str) -> None:
         np.testing.assert_allclose(state.u[axis], expected, atol=n * EPS * abs(pull))
         assert moved.count == np.count_nonzero(expected)
         assert (moved.lowest[0], moved.highest[0]) == (n - moved.count, n - 1)
+
+
+@pytest.mark.parametrize("shape", [(7, 3, 1), (50, 49, 48), (1290, 1290, 1290), (2, 2, 2**29 - 1), (1, 2**31 - 1, 1)])
+@given(seeds)
+def test_the_box_of_what_moved_is_that_of_its_indices(shape: tuple[int, int, int], seed: int) -> None:
+    """Also of elements at the ends of rows and planes, up to the largest number that an element may have."""
+    _, ny, nz = shape
+    rng = np.random.default_rng(seed)
+    n = int(np.prod(shape, dtype=np.int64))
+    ends = rng.integers(1, n // (ny * nz) * ny + 1, 20) * nz
+    elements = np.concatenate([rng.integers(0, n, 20), ends - 1, ends % n, [n - 1]]).astype(np.int32)
+    rng.shuffle(elements)
+    some = elements[: rng.integers(1, len(elements))]
+    box = np.array([shape[0], -1, ny, -1, nz, -1])
+    widen(some, 0, len(some), np.array([ny * nz, -ny * nz, nz, -nz, 1, -1, *shape]), box)
+    index = np.stack(np.unravel_index(some, shape))
+    assert np.array_equal(box[0::2], index.min(axis=1))
+    assert np.array_equal(box[1::2], index.max(axis=1))
 
 
 @pytest.mark.parametrize("axis", range(3))

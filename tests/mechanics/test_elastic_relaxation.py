@@ -15,7 +15,7 @@ from volume_samples import SPACING, block, check_structure, cut_some, material, 
 
 from trainer.mechanics.elastic_relaxation import SWEEPS, force_on, relax, sweep
 from trainer.mechanics.tissue_law import constants, link_answer, rest_stiffness, slope, stress
-from trainer.mechanics.volume import Volume, VolumeState, build, start, tack, wake
+from trainer.mechanics.volume import FREE, Volume, VolumeState, build, start, tack, wake
 from trainer.mechanics.volume_drag import drag
 
 EPS = float(np.finfo(np.float32).eps)
@@ -122,6 +122,33 @@ def test_both_kernels_agree_on_one_linear_material(seed: int, narrow: bool) -> N
             sweep(volume, state, 0.01)
         results.append(state.u)
     np.testing.assert_allclose(results[0], results[1], atol=50 * EPS * 5)
+
+
+@pytest.mark.parametrize("shape", [(9, 8, 20), (72, 60, 64)])
+def test_a_sweep_is_what_all_elements_at_once_give(shape: tuple[int, int, int]) -> None:
+    """The formula of the sweep by whole arrays, from the places before it: the same bits, with cuts and tacks, in a
+    volume that is smoothed in one run and in one that is larger than the cache and smoothed a part at a time."""
+    volume = block(shape)
+    state = start(volume)
+    cut_some(volume, state, 1, 0.2)
+    rng = np.random.default_rng(2)
+    tack(state, rng.integers(0, volume.labels.size, volume.labels.size // 9))
+    state.u[:] = rng.normal(size=state.u.shape)
+    everything_awake(volume, state)
+    k = rest_stiffness(volume)[0]
+    ways = (-math.expm1(-1.0 / SWEEPS) * k / (2.0 * k.sum(axis=0))).astype(np.float32)
+    links = state.links.reshape(shape)
+    expected = state.u.reshape(3, *shape).copy()
+    for c, x in enumerate(state.u.reshape(3, *shape).copy()):
+        pull = np.zeros(shape, np.float32)
+        for axis in range(3):
+            apart = [
+                np.where(links & (1 << d), np.roll(x, (-1, 1)[d % 2], axis) - x, 0) for d in (2 * axis, 2 * axis + 1)
+            ]
+            pull = pull + ways[axis, c] * (apart[0] + apart[1])
+        expected[c] = np.where(links & FREE, x + pull, x)
+    sweep(volume, state, volume.materials[0].time_constant_s / SWEEPS)
+    assert np.array_equal(state.u.reshape(3, *shape), expected)
 
 
 def test_several_threads_give_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -111,6 +111,30 @@ def spread(u0, u1, u2, links, mark, moved, strides, low, high, queue, tail):  # 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def widen(queue, begin, tail, strides, box):  # type: ignore[no-untyped-def]
+    """Widen ``box`` by the elements ``queue[begin:tail]``.
+
+    In floating point, since 16 of these are divided at once: (e + ½)/p is at least 1/(2p) away from a whole number, and
+    its rounding errors are below 2^-52 (e + ½)/p for each e of 31 bits, so that what is cut off is the quotient.
+    """
+    plane, row = np.int32(strides[0]), np.int32(strides[2])
+    per_plane, per_row = 1.0 / plane, 1.0 / row
+    i0, i1, j0, j1, k0, k1 = box
+    i0, i1, j0 = np.int32(i0), np.int32(i1), np.int32(j0)
+    j1, k0, k1 = np.int32(j1), np.int32(k0), np.int32(k1)
+    for head in range(np.uint64(begin), np.uint64(tail)):
+        e = queue[head]
+        i = np.int32((e + 0.5) * per_plane)
+        in_plane = np.int32(e - i * plane)
+        j = np.int32((in_plane + 0.5) * per_row)
+        k = np.int32(in_plane - j * row)
+        i0, i1 = min(i0, i), max(i1, i)
+        j0, j1 = min(j0, j), max(j1, j)
+        k0, k1 = min(k0, k), max(k1, k)
+    box[0], box[1], box[2], box[3], box[4], box[5] = i0, i1, j0, j1, k0, k1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def cross_section(u0, u1, u2, links, mark, moved, strides, low, high, held, to, queue, box):  # type: ignore[no-untyped-def]
     """Put the elements ``held`` (h,) at the displacements ``to`` (h, 3) and work off the lists along z and y.
 
@@ -137,11 +161,7 @@ def cross_section(u0, u1, u2, links, mark, moved, strides, low, high, held, to, 
         for d in (2 * axis, 2 * axis + 1):
             core = box[2 * axis + 1 - d % 2] if box[2 * axis] < box[2 * axis + 1] else -1
             tail = work_off(u0, u1, u2, links, mark, moved, strides, d, low, high, begin, core, queue, tail)
-    for head in range(len(held), tail):
-        e = queue[head]
-        j, k = e % size_x // size_y, e % size_y
-        box[2], box[3] = min(box[2], j), max(box[3], j)
-        box[4], box[5] = min(box[4], k), max(box[5], k)
+    widen(queue, len(held), tail, strides, box)
     return tail, not_free
 
 
@@ -152,9 +172,7 @@ def lengthwise(u0, u1, u2, links, mark, moved, strides, low, high, queue, tail, 
     for d in range(2):
         core = box[1 - d] if box[0] < box[1] else -1
         tail = work_off(u0, u1, u2, links, mark, moved, strides, d, low, high, begin, core, queue, tail)
-    for head in range(begin, tail):
-        i = queue[head] // strides[0]
-        box[0], box[1] = min(box[0], i), max(box[1], i)
+    widen(queue, begin, tail, strides, box)
     return tail
 
 
@@ -172,19 +190,3 @@ def over_seams(u0, u1, u2, links, mark, moved, ends, low, high, back_low, back_h
             queue[tail] = a
             tail += 1
     return tail
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def widen(queue, begin, tail, strides, box):  # type: ignore[no-untyped-def]
-    """Widen ``box`` by the elements ``queue[begin:tail]``."""
-    index = np.uint64
-    plane, row = index(strides[0]), index(strides[2])
-    for head in range(index(begin), index(tail)):
-        e = index(queue[head])
-        i = e // plane
-        in_plane = e - i * plane
-        j = in_plane // row
-        k = in_plane - j * row
-        box[0], box[1] = min(box[0], np.int64(i)), max(box[1], np.int64(i))
-        box[2], box[3] = min(box[2], np.int64(j)), max(box[3], np.int64(j))
-        box[4], box[5] = min(box[4], np.int64(k)), max(box[5], np.int64(k))

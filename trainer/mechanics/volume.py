@@ -33,6 +33,7 @@ from trainer.geometry import Array
 if TYPE_CHECKING:
     from trainer.mechanics.chainmail_corrected import Ring
     from trainer.mechanics.chainmail_mixed import Waiting
+    from trainer.mechanics.elastic_relaxation import Sweeps
 
 Bytes = NDArray[np.uint8]
 Singles = NDArray[np.float32]
@@ -142,6 +143,8 @@ class VolumeState:
     owed_s: float = 0.0  # time for which relaxation has not yet swept
     waiting: Waiting | None = None  # room for ChainMail in several materials, largest violation first
     ring: Ring | None = None  # the same, corrected
+    sweeps: Sweeps | None = None  # what is the same in all sweeps of relaxation
+    edges: Singles | None = None  # room for planes of them
 
 
 @dataclass(frozen=True)
