@@ -338,7 +338,11 @@ def fitted(strain: np.ndarray, measured: np.ndarray) -> tuple[float, float]:
 def test_a_ligament_fitted_to_one_table_answers_like_the_other() -> None:
     """Cruciate ligament at 10 % a minute: E and b of the J-curve are fitted to the ascending order of rates, a bar with
     them is stretched strain by strain, and its stress is held against the descending order. The error that is stated
-    is the largest relative one from 1 % strain on (below, the slope at rest is all there is)."""
+    is the largest relative one from 1 % strain (below, the slope at rest is all there is) to where the fit ends.
+
+    Both tables are loading curves, of the two ligaments of a pair (Readioff et al. 2020, PeerJ 8:e10635): one is not
+    the other's unloading, and no law that follows the one can be nearer to the other than they are to each other. That
+    is what the error comes to, but for the fit's own, f: a (1 + f) instead of a against o errs by f a/o more."""
     strain, measured = table("ascending")
     young, steep = fitted(strain, measured)
     volume = block(
@@ -348,18 +352,20 @@ def test_a_ligament_fitted_to_one_table_answers_like_the_other() -> None:
     )
     state = start(volume)
     tack(state, np.array([0, 5]))
-    other_strain, other = table("descending")
+    other = table("descending")[1][: len(strain)]
+    np.testing.assert_array_equal(table("descending")[0][: len(strain)], strain)
+    used = strain >= 0.01
     off = {"fitted": 0.0, "other": 0.0}
-    for name, (at, truth) in {"fitted": (strain, measured), "other": (other_strain, other)}.items():
-        for e, t in zip(at, truth, strict=True):
-            if e < 0.01:
-                continue
+    for name, truth in {"fitted": measured, "other": other}.items():
+        for e, t in zip(strain[used], truth[used], strict=True):
             state.u[0] = e * np.arange(6)
             got = -force_on(volume, state, np.array([5]))[0]
             off[name] = max(off[name], abs(got - t) / t)
     assert 50.0 < steep < 70.0
     assert off["fitted"] < 0.02
-    assert 0.3 < off["other"] < 0.35  # the two orders differ by as much
+    assert 0.3 < off["other"] < 0.35
+    apart = measured[used] / other[used]
+    assert off["other"] == pytest.approx(np.abs(apart - 1.0).max(), abs=off["fitted"] * apart.max())
 
 
 def test_a_steep_curve_does_not_overshoot() -> None:
