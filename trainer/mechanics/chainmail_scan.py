@@ -16,12 +16,15 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from trainer.mechanics.prefetch import ask_for
 from trainer.mechanics.volume import FREE
 
 #: Elements of a plane that go through all planes together: they and those before fit into a cache of 1 MB.
 SHARE = 65536
 #: Elements that are looked at together: if all are to be considered no one asks each.
 RUN = 4096
+#: Then so many follow while memory is asked for that comes so many later (measured: a tenth less time at 128³).
+PART, AHEAD = 512, 2048
 #: Else they are taken by the page of memory, and a page of which none is to be considered is not written to.
 PAGE = 1024
 
@@ -46,24 +49,24 @@ def _any_take(mark_before, links, need, moved):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _follow_all(u0, u1, u2, s0, s1, s2, l0, l1, l2, h0, h1, h2, mark, moved):  # type: ignore[no-untyped-def]
-    """A run into the limits of the run before; marks it and returns how many moved."""
+def _follow_all(u0, u1, u2, a, b, width, l0, l1, l2, h0, h1, h2, mark, moved):  # type: ignore[no-untyped-def]
+    """The run that begins at ``a`` into the limits of the one at ``b``; marks it and returns how many moved."""
     still = np.int32(0)
-    for k in range(len(u0)):
-        x, y, z = u0[k], u1[k], u2[k]
-        nx = min(max(x, s0[k] + l0), s0[k] + h0)
-        ny = min(max(y, s1[k] + l1), s1[k] + h1)
-        nz = min(max(z, s2[k] + l2), s2[k] + h2)
+    for k in range(width):
+        x, y, z = u0[a + k], u1[a + k], u2[a + k]
+        nx = min(max(x, u0[b + k] + l0), u0[b + k] + h0)
+        ny = min(max(y, u1[b + k] + l1), u1[b + k] + h1)
+        nz = min(max(z, u2[b + k] + l2), u2[b + k] + h2)
         rests = np.int32((nx == x) & (ny == y) & (nz == z))
-        u0[k], u1[k], u2[k] = nx, ny, nz
-        mark[k] = np.uint8(moved + np.uint8(rests))
+        u0[a + k], u1[a + k], u2[a + k] = nx, ny, nz
+        mark[a + k] = np.uint8(moved + np.uint8(rests))
         still += rests
-    return len(u0) - still
+    return np.int64(width) - still
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _follow_some(u0, u1, u2, s0, s1, s2, l0, l1, l2, h0, h1, h2, mark, mark_before, links, need, moved):  # type: ignore[no-untyped-def]
-    """The same for those that have a sponsor; for the others there are no limits."""
+    """The same for those of a run that have a sponsor in the run before; for the others there are no limits."""
     none = np.float32(np.inf)
     count = np.int32(0)
     for k in range(len(u0)):
@@ -91,19 +94,25 @@ def scan(u0, u1, u2, links, mark, moved, shape, d, low, high, plane, first, last
     total = 0
     reached = plane
     for share in range(first, last, SHARE):
+        end = min(share + SHARE, last)
         i = plane + step
         while 0 <= i < nx:
             in_plane = 0
-            for run in range(share, min(share + SHARE, last), RUN):
+            for run in range(share, end, RUN):
                 a = i * ny * nz + run
-                width = min(RUN, min(share + SHARE, last) - run)
+                width = min(RUN, end - run)
                 b = a - step * ny * nz
-                here, before = slice(a, a + width), slice(b, b + width)
-                if _all_take(mark[before], links[here], need, moved):
-                    in_plane += _follow_all(
-                        u0[here], u1[here], u2[here], u0[before], u1[before], u2[before],
-                        low[0], low[1], low[2], high[0], high[1], high[2], mark[here], moved,
-                    )  # fmt: skip
+                if _all_take(mark[b : b + width], links[a : a + width], need, moved):
+                    for part in range(0, width, PART):
+                        later = a + part + AHEAD
+                        if run + part + AHEAD >= end:  # in the next plane
+                            later += step * ny * nz - (end - share)
+                        for values in (u0, u1, u2):
+                            ask_for(values, later, later + PART)
+                        in_plane += _follow_all(
+                            u0, u1, u2, np.uint64(a + part), np.uint64(b + part), np.uint64(min(PART, width - part)),
+                            low[0], low[1], low[2], high[0], high[1], high[2], mark, moved,
+                        )  # fmt: skip
                     continue
                 for part in range(0, width, PAGE):
                     here = slice(a + part, a + min(part + PAGE, width))

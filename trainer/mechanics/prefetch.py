@@ -46,6 +46,6 @@ def _compiled(values, index):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def ask_for(values, begin, end):  # type: ignore[no-untyped-def]
-    """Ask for the elements ``begin`` to ``end`` (not included) of ``values`` (n,); those beyond n are left out."""
-    for k in range(begin, min(end, len(values)), LINE // values.itemsize):
+    """Ask for the elements ``begin`` to ``end`` (not included) of ``values`` (n,), as far as they are there."""
+    for k in range(max(begin, 0), min(end, len(values)), LINE // values.itemsize):
         _ask(values, k)
