@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from volume_samples import SPACING, block, check_structure, material, random_shape, seeds, worst_violation
 
@@ -49,7 +49,8 @@ def test_a_cut_of_half_the_depth_leaves_one_body() -> None:
 
 @given(seeds)
 def test_a_cut_breaks_what_straddles_its_plane_wherever_tissue_went(seed: int) -> None:
-    """For a knife wider than the tissue: exactly the links whose ends are now on different sides of its plane."""
+    """For a knife wider than the tissue: exactly the links whose ends are now on different sides of its plane. An
+    element within 1e-6 mm of it (seven in 100 000 volumes have one) is on neither by rounding."""
     rng = np.random.default_rng(seed)
     labels = random_shape(seed, (6, 7, 8), 0.2)
     volume = build(labels, SPACING, {1: material()})
@@ -66,7 +67,7 @@ def test_a_cut_breaks_what_straddles_its_plane_wherever_tissue_went(seed: int) -
     edge0, edge1 = middle - way, middle + way
     done = cut(volume, state, [edge0 - across, edge0 + across], [edge1 - across, edge1 + across])
     side = (at - middle) @ normal >= 0.0
-    assert np.abs((at[soft] - middle) @ normal).min() > 1e-6 * 1e6  # nothing lies in the plane
+    assume(np.abs((at[soft] - middle) @ normal).min() > 1e-6 * 1e6)
     count = 0
     for axis in range(3):
         a = np.flatnonzero(before & (1 << 2 * axis))
