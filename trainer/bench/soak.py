@@ -73,17 +73,23 @@ class Soak:
     session_of: array[int] = field(default_factory=lambda: array("l"))  # in which session
     latency: LatencyCount = field(default_factory=LatencyCount)
     work_ms: array[float] = field(default_factory=lambda: array("d"))
-    began_s: float = field(default_factory=lambda: time.monotonic())
-    told_s: float = field(default_factory=lambda: time.monotonic())  # when progress was last told
+    began_s: float = math.inf  # when the first session's device was there
+    told_s: float = 0.0  # when progress was last told
+
+    def begin(self) -> None:
+        """The time begins, unless it runs already: what opening the first device takes is no practice."""
+        self.began_s = min(self.began_s, time.monotonic())
+        self.told_s = max(self.told_s, self.began_s)
 
     def elapsed_s(self) -> float:
-        return time.monotonic() - self.began_s
+        return max(0.0, time.monotonic() - self.began_s)
 
 
 class Gauges:
     """A sink that reads them once a second, and tells of them now and then."""
 
     def __init__(self, soak: Soak, driver: object, sinks: Sequence[object], tell: Callable[[str], None]) -> None:
+        soak.begin()
         self._soak, self._driver, self._tell = soak, driver, tell
         self._queues = {type(sink).__name__: sink for sink in sinks if isinstance(sink, Queued)}
         self._session = soak.sessions[-1]
