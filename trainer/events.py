@@ -85,7 +85,11 @@ class Contact(Event):
 
 @dataclass(frozen=True)
 class Pierce(Event):
-    """The needle's tip went through a wall; all values are those of the instant of crossing."""
+    """The needle's tip went through a wall; all values are those of the instant of crossing.
+
+    ``force_mN`` is the force of the tip on the wall that made it give way: along the needle the wall's puncture force;
+    of a tip that was pushed aside the whole force, which is then twice as much.
+    """
 
     kind = "pierce"
     body: str
@@ -99,7 +103,7 @@ class Pierce(Event):
     tangent: Vector  # the needle's direction at its tip
     normal: Vector  # outward normal of the undented wall
     entry_angle_deg: float  # angle of tangent to the wall's tangent plane, 0..90
-    force_mN: float  # force on the tip along its tangent
+    force_mN: float
     depth_mm: float  # depth of the tip below the undented outer surface, along the normal
 
 

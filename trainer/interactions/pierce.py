@@ -109,7 +109,7 @@ def puncture(world: World, before: Rigid, after: Rigid, force: Array, start_s: f
         point=world.place_in_world(tip), axial_mm=hole.place.axial_mm, clock_deg=math.degrees(hole.place.clock),
         tangent=world.way_in_world(heading), normal=world.way_in_world(upright),
         entry_angle_deg=math.degrees(math.asin(min(1.0, abs(float(heading @ upright))))),
-        force_mN=limit if along >= limit else along, depth_mm=float((surface - tip) @ upright),
+        force_mN=limit if reached == along else SIDEWAYS * limit, depth_mm=float((surface - tip) @ upright),
     )  # fmt: skip
 
 

@@ -77,9 +77,12 @@ def breaks(performance: Performance, _: str) -> float:
     return _count(performance, Break)
 
 
-@metric("puncture_force_max_mN", "mN", pierces)
+@metric("puncture_force_max_mN", "mN", pierces, version="2")
 def puncture_force(performance: Performance, _: str) -> float | None:
-    """Largest force on the needle's tip at a crossing."""
+    """Largest force of the needle's tip on a wall as the wall gave way: see the event ``pierce``.
+
+    Along the needle, or the whole of it where the tip was pushed aside and made its hole so.
+    """
     return max((p.force_mN for p in performance.crossings), default=None)
 
 

@@ -1,0 +1,79 @@
+"""The needle's tip at a wall: what it takes to go through, what lets it go, and what it does unseen."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from performing import one_drive
+
+from trainer import scene
+from trainer.drivers.hand_motion import needle_pose
+from trainer.events import Event, Pierce
+from trainer.geometry import Array, Rigid, unit
+from trainer.interactions.pierce import SIDEWAYS
+from trainer.poses import ToolPoses
+
+LEFT, RIGHT = 0, 1
+TASK = one_drive()
+VESSEL = TASK.scene.vessel[0]
+
+
+class Needle:
+    """A scene whose needle is led by its tip: where it is to be, and how it lies."""
+
+    def __init__(self) -> None:
+        self.scene = scene.build(TASK)
+        view = self.scene.view()
+        self.point, self.normal = view.look("A", 0.0, 0.6, "outer")
+        self.axis = view.vessel_axis["A"]
+        self._tool_from_needle = self.scene.world.needle_pose.inverse() @ view.poses.world_from_tool(RIGHT)
+
+    def lying(self, tip: Array, steep_deg: float) -> Rigid:
+        """The needle with its tip at ``tip``, which points along the vessel and down into it at this angle."""
+        steep = np.radians(steep_deg)
+        heading = np.cos(steep) * self.axis - np.sin(steep) * self.normal
+        upright = np.cos(steep) * self.normal + np.sin(steep) * self.axis
+        assert self.scene.world.needle is not None
+        return needle_pose(tip, heading, upright, 0.0, self.scene.world.needle.radius)
+
+    def to(self, pose: Rigid, seen: bool = True) -> tuple[Event, ...]:
+        """One tick."""
+        tool, home = pose @ self._tool_from_needle, self.scene.home
+        position, quaternion = home.position.copy(), home.quaternion.copy()
+        position[RIGHT], quaternion[RIGHT] = tool.position, tool.quaternion
+        return self.scene.step(ToolPoses(position, quaternion, home.closure, np.array([True, seen])))
+
+    def touch(self, steep_deg: float) -> Rigid:
+        """Bring the tip along itself to the wall, 3 µm a tick, until it touches."""
+        pose = self.lying(self.point, steep_deg)
+        heading = pose.rotate(np.array([1.0, 0.0, 0.0]))
+        for k in range(200):
+            self.to(Rigid(self.point + (0.003 * k - 0.3) * heading, pose.quaternion))
+            if self.scene.world.contact is not None:
+                return self.scene.world.needle_pose
+        raise AssertionError("the tip does not come to the wall")
+
+
+def test_the_force_of_a_pierce_is_that_of_the_wall_as_it_gives_way() -> None:
+    """Along the needle its puncture force; of a tip pushed aside the whole force, SIDEWAYS times as much.
+
+    Exactly: the instant is interpolated to it. Along the needle the tip pushes less then, and may even pull.
+    """
+    limit = VESSEL.puncture_outer_mN.value
+    n = Needle()
+    across = np.cross(n.axis, n.normal)
+    ways = {  # how steep the needle is, degrees; the way of its tip; the force that makes the hole
+        "along itself": (80.0, np.cos(np.radians(80.0)) * n.axis - np.sin(np.radians(80.0)) * n.normal, limit),
+        "across and down": (20.0, 0.9 * across - 0.43 * n.normal, SIDEWAYS * limit),
+    }
+    for name, (steep, way, expected) in ways.items():
+        n = Needle()
+        start = n.touch(steep)
+        made = [
+            e
+            for k in range(400)
+            for e in n.to(Rigid(start.position + 0.005 * (k + 1) * unit(way), start.quaternion))
+            if isinstance(e, Pierce)
+        ]
+        assert made, name
+        assert made[0].force_mN == pytest.approx(expected, abs=1e-12), name
