@@ -77,3 +77,23 @@ def test_the_force_of_a_pierce_is_that_of_the_wall_as_it_gives_way() -> None:
         ]
         assert made, name
         assert made[0].force_mN == pytest.approx(expected, abs=1e-12), name
+
+
+@pytest.mark.parametrize("lift_deg", [0.0, 10.0])
+def test_a_tip_that_is_drawn_back_takes_none_of_the_wall_along(lift_deg: float) -> None:
+    """The tip has touched, and goes back along the wall, or lifts off it: no sharp point drags what it does not press.
+
+    Either it lets go or it makes a hole, so that no movement ends with a force above that of a tip pushed aside; a
+    tenth more may be unsettled. In the end it is 1.8 mm away, and the wall at rest, the only state without force.
+    """
+    n = Needle()
+    start = n.touch(35.0)
+    way = -np.cos(np.radians(lift_deg)) * n.axis + np.sin(np.radians(lift_deg)) * n.normal
+    world = n.scene.world
+    for k in range(60):
+        events = n.to(Rigid(start.position + 0.03 * (k + 1) * way, start.quaternion))
+        assert not [e for e in events if isinstance(e, Pierce)]
+        assert world.tissue_force_mN <= 1.1 * SIDEWAYS * VESSEL.puncture_outer_mN.value, k
+    assert world.contact is None
+    assert world.solver is not None
+    assert np.array_equal(world.solver.x, world.solver.mesh.rest)

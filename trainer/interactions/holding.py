@@ -13,7 +13,8 @@ from trainer.instruments.needle import needle_point, needle_tangent
 from trainer.interactions import giving_way, pierce, thread_pull
 from trainer.interactions.giving_way import Grips
 from trainer.interactions.world import Hole, World
-from trainer.mechanics.attachments import Anchors, Frictions
+from trainer.mechanics.attachments import Anchors, Cable, Frictions
+from trainer.mechanics.equilibrium import Result
 
 #: Stiffness of what holds the tissue, in units of modulus times wall thickness: a hundred times the wall's own,
 #: so that a held point is off its place by a hundredth of the dent that the force makes.
@@ -96,15 +97,23 @@ def equilibrate(world: World, before: Rigid, start_s: float, span_s: float, tool
     rows = thread_pull.constraints(world, lagging=False) if world.thread is not None else None
     taut = thread_pull.cables(world, rows) if rows is not None else []
     world.before = world.solver.x.copy()
-    found = world.solver.solve(
+    found = _solve(world, held, taut, tolerance_mN)
+    if pierce.lift(world, start_s + span_s):
+        held = grips(world)
+        found = _solve(world, held, taut, tolerance_mN)
+    tip = next((found.anchor_force[r] for r, who in enumerate(held.owner) if who is None), None)
+    if tip is not None:
+        pierce.puncture(world, before, world.needle_pose, tip, start_s, span_s, tool)
+    world.tension_mN = float(np.max(found.tension, initial=0.0))
+    giving_way.judge(world, held, rows, taut, found, start_s + span_s)
+
+
+def _solve(world: World, held: Grips, taut: list[tuple[int, int, Cable]], tolerance_mN: float) -> Result:
+    assert world.solver is not None
+    return world.solver.solve(
         held.anchors,
         tuple(c for _, _, c in taut),
         drag(world),
         tolerance_mN=tolerance_mN,
         max_iterations=MOST_ITERATIONS,
     )
-    tip = next((found.anchor_force[r] for r, who in enumerate(held.owner) if who is None), None)
-    if tip is not None:
-        pierce.puncture(world, before, world.needle_pose, tip, start_s, span_s, tool)
-    world.tension_mN = float(np.max(found.tension, initial=0.0))
-    giving_way.judge(world, held, rows, taut, found, start_s + span_s)

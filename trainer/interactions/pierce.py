@@ -69,23 +69,32 @@ def glide(world: World) -> None:
     contact.slot = world.solver.hold(contact.place.nodes, contact.place.weights)
 
 
-def puncture(world: World, before: Rigid, after: Rigid, force: Array, start_s: float, span_s: float, tool: str) -> None:
-    """Judge the contact by the ``force`` (3,) mN of the tip on the wall at the end of a movement.
+def lift(world: World, time_s: float) -> bool:
+    """End the contact where the wall pulls at the tip: it is back on the side that it came from, as the wall lies now.
 
-    The contact ends when the wall pulls the tip back; it becomes a hole when the wall gives way.
+    Returns whether it ended. The wall then goes back to where it lies without the tip, which may take it over the tip
+    again: a contact anew, at what it touches there. So a tip that is drawn along a wall, or off it, takes none of the
+    wall with it.
     """
+    contact = world.contact
+    if contact is None or world.solver is None:
+        return False
+    world.touched[contact.place.vessel, contact.place.wall] = time_s
+    if _side(world, contact.place) * (1.0 if contact.inwards else -1.0) <= 0.0:
+        return False
+    world.solver.drop(contact.slot)
+    world.contact = None
+    world.before = world.solver.x.copy()
+    return True
+
+
+def puncture(world: World, before: Rigid, after: Rigid, force: Array, start_s: float, span_s: float, tool: str) -> None:
+    """Make the contact a hole where the wall gives way to the ``force`` (3,) mN of the tip at a movement's end."""
     contact = world.contact
     if contact is None or world.tissue is None or world.solver is None:
         return
     normal, surface = world.undented(contact.place)
     tangent = after.rotate(np.array([1.0, 0.0, 0.0]))
-    world.touched[contact.place.vessel, contact.place.wall] = start_s + span_s
-    if _side(world, contact.place) * (1.0 if contact.inwards else -1.0) > 0.0:
-        # The wall pulls at the tip: it is back on the side that it came from, as the wall lies now.
-        world.solver.drop(contact.slot)
-        world.contact = None
-        world.before = world.solver.x.copy()
-        return
     along, limit = float(force @ tangent), _puncture_mN(world, contact.place)
     reached = max(along, length(force) / SIDEWAYS)
     if reached < limit:
