@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 from performing import one_drive
 
 from trainer import scene
+from trainer.curriculum import Task
 from trainer.drivers.hand_motion import needle_pose
 from trainer.events import Event, Pierce
 from trainer.geometry import Array, Rigid, unit
 from trainer.interactions.pierce import SIDEWAYS
+from trainer.mechanics.attachments import Anchors
+from trainer.mechanics.equilibrium import Equilibrium, Result
 from trainer.poses import ToolPoses
 
 LEFT, RIGHT = 0, 1
@@ -21,8 +27,8 @@ VESSEL = TASK.scene.vessel[0]
 class Needle:
     """A scene whose needle is led by its tip: where it is to be, and how it lies."""
 
-    def __init__(self) -> None:
-        self.scene = scene.build(TASK)
+    def __init__(self, task: Task = TASK) -> None:
+        self.scene = scene.build(task)
         view = self.scene.view()
         self.point, self.normal = view.look("A", 0.0, 0.6, "outer")
         self.axis = view.vessel_axis["A"]
@@ -97,3 +103,27 @@ def test_a_tip_that_is_drawn_back_takes_none_of_the_wall_along(lift_deg: float) 
     assert world.contact is None
     assert world.solver is not None
     assert np.array_equal(world.solver.x, world.solver.mesh.rest)
+
+
+def test_nothing_is_judged_by_forces_that_are_not_settled(monkeypatch: pytest.MonkeyPatch) -> None:
+    """While a solve leaves as much unbalanced as the tip pushes, it makes no hole and exceeds no limit of the task.
+
+    The tip goes 0.6 mm into the wall so, and when the forces settle there, both are told at once. The limit is lowered
+    to what so soft a wall bears.
+    """
+    limit = replace(TASK.limits["tissue_pull"], value=2.0)
+    solve = Equilibrium.solve
+
+    def unsettled(self: Equilibrium, anchors: Anchors, *rest: Any, **options: Any) -> Result:
+        found = solve(self, anchors, *rest, **options)
+        return replace(found, converged=False, residual_mN=float(np.sum(np.abs(found.anchor_force))))
+
+    n = Needle(replace(TASK, limits={"tissue_pull": limit}))
+    start = n.touch(80.0)
+    with monkeypatch.context() as m:
+        m.setattr(Equilibrium, "solve", unsettled)
+        for k in range(60):
+            there = Rigid(start.position - 0.01 * (k + 1) * n.normal, start.quaternion)
+            assert n.to(there) == ()
+    assert n.scene.world.tissue_force_mN > limit.value
+    assert {"pierce", "overforce"} <= {e.kind for e in n.to(there)}

@@ -28,6 +28,11 @@ class Grips:
     owner: tuple[Hole | int | None, ...]  # a hole on the needle, an instrument, or None for the needle's tip
 
 
+def settled(found: Result, force_mN: float) -> bool:
+    """Whether a force of an equilibrium is one to judge by."""
+    return found.converged or found.residual_mN <= SETTLED * force_mN
+
+
 def judge(
     world: World,
     held: Grips,
@@ -36,11 +41,16 @@ def judge(
     found: Result,
     time_s: float,
 ) -> None:
-    """Judge the forces that an equilibrium ``found``. One thing gives way at a time: the rest may bear without it."""
+    """Judge the forces that an equilibrium ``found``, once they are settled.
+
+    What gives way in one movement: of each thread that is drawn taut its weakest grip, or the thread; of all holes the
+    one that is pulled furthest over what it bears; the needle's grip; and each wall in jaws. The rest may bear without
+    them, and is judged by the next equilibrium.
+    """
     by_needle, by_jaw = _pulls(world, held, found.anchor_force)
     loads = [length(f) for f in by_jaw]
     world.tissue_force_mN = max(world.tension_mN, length(by_needle), *loads)
-    if found.residual_mN <= SETTLED * world.tissue_force_mN:
+    if settled(found, world.tissue_force_mN):
         holes = _on_needle(held, found.anchor_force)
         for (first, last, cable), tension in zip(taut, found.tension, strict=True):
             assert rows is not None
@@ -50,7 +60,8 @@ def judge(
         _judge_needle(world, length(by_needle), time_s)
         for i, load in enumerate(loads):
             _judge_jaw(world, i, load, time_s)
-    _limits(world, time_s)
+        check_limit(world, "tissue_pull", world.tissue_force_mN, "", "", time_s)
+    _pressures(world, time_s)
 
 
 def relieve(world: World, time_s: float) -> thread_pull.Slack | None:
@@ -165,9 +176,8 @@ def _judge_jaw(world: World, tool: int, load: float, time_s: float) -> None:
         grasp.slip(world, tool, load, limit, time_s)
 
 
-def _limits(world: World, time_s: float) -> None:
-    """Report the task's limits that are exceeded, once for each excursion."""
-    check_limit(world, "tissue_pull", world.tissue_force_mN, "", "", time_s)
+def _pressures(world: World, time_s: float) -> None:
+    """Report jaws that press a wall harder than the task allows: a matter of their closure, not of an equilibrium."""
     for i, jaw in enumerate(world.jaws):
         pressure, body = 0.0, ""
         if jaw.target == "wall" and world.tissue is not None:

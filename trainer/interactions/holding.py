@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from trainer.geometry import Array, Rigid
+from trainer.geometry import Array, Rigid, length
 from trainer.instruments.needle import needle_point, needle_tangent
 from trainer.interactions import giving_way, pierce, thread_pull
 from trainer.interactions.giving_way import Grips
@@ -102,7 +102,7 @@ def equilibrate(world: World, before: Rigid, start_s: float, span_s: float, tool
         held = grips(world)
         found = _solve(world, held, taut, tolerance_mN)
     tip = next((found.anchor_force[r] for r, who in enumerate(held.owner) if who is None), None)
-    if tip is not None:
+    if tip is not None and giving_way.settled(found, length(tip)):
         pierce.puncture(world, before, world.needle_pose, tip, start_s, span_s, tool)
     world.tension_mN = float(np.max(found.tension, initial=0.0))
     giving_way.judge(world, held, rows, taut, found, start_s + span_s)

@@ -33,6 +33,8 @@ JUST_THROUGH_MM = 0.4
 
 def detect(world: World, before: Rigid, after: Rigid, start_s: float, span_s: float, tool: str) -> None:
     """Begin a contact where the tip meets a wall on its way from ``before`` to ``after`` (world_from_needle)."""
+    if world.contact is not None:
+        world.contact.fraction = 0.0
     if world.tissue is None or world.solver is None or world.contact is not None:
         return
     triangles = world.surface
@@ -99,7 +101,7 @@ def puncture(world: World, before: Rigid, after: Rigid, force: Array, start_s: f
     reached = max(along, length(force) / SIDEWAYS)
     if reached < limit:
         contact.stuck = _sticks(world, after, normal)
-        contact.force_mN, contact.normal, contact.fraction = reached, normal, 0.0
+        contact.force_mN, contact.normal = reached, normal
         return
     rise = reached - contact.force_mN
     share = contact.fraction + (1.0 - contact.fraction) * ((limit - contact.force_mN) / rise if rise > 0.0 else 1.0)

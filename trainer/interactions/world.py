@@ -47,7 +47,7 @@ class TipContact:
     inwards: bool  # pressing towards the lumen
     stuck: bool  # False while the tip glides along the wall
     fraction: float  # of the movement at which it began, or 0 where it began earlier
-    force_mN: float  # along the needle, or half of the whole if that is more; at the end of the last movement
+    force_mN: float  # along the needle, or half of the whole if that is more; at the end of the last settled one
     normal: Array  # (3,) of the undented wall, at the end of the last movement
 
 
