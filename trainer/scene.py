@@ -32,6 +32,7 @@ from trainer.interactions import (
     seeing,
     thread_pull,
     tissue_handling,
+    unseen,
 )
 from trainer.interactions.world import Jaw, World
 from trainer.mechanics.equilibrium import Equilibrium
@@ -44,7 +45,7 @@ from trainer.view import View
 STRIDE_MM = 0.1
 #: In a region of the anatomy so much of a voxel is a stride: nothing there is finer.
 STRIDE_VOXELS = 0.25
-#: … but in no more than this many: beyond 1.6 mm in a tick the motion is a leap of the tracker.
+#: … but in no more than this many: beyond 1.6 mm in a tick of 10 ms the motion is a leap of the tracker.
 MOST_MOVEMENTS = 16
 
 
@@ -144,7 +145,9 @@ class Scene:
         if self.tick == 0:
             world.emit(TaskStarted, 0.0, "", task=task.name)
             grasp.report_held(world, 0.0)
+        seen_before = [j.seen for j in world.jaws]
         targets, closures = self._tracked(poses, start_s)
+        unseen.watch(world, seen_before, targets)
         starts, from_closures = [j.pose for j in world.jaws], np.array([j.closure for j in world.jaws])
         movements = self._movements(starts, targets)
         for m in range(movements):
@@ -154,6 +157,7 @@ class Scene:
             self._move(at, jaws, start_s + m / movements * dt, dt / movements)
             if world.broken:
                 break
+        unseen.find(world)
         self._judge(start_s + dt)
         self.tick += 1
         return tuple(world.events)

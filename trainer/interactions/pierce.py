@@ -17,7 +17,7 @@ from trainer.events import Contact, Pierce, PullThrough, Withdraw
 from trainer.geometry import Array, Rigid, cross, length, unit
 from trainer.instruments.needle import needle_closest, needle_point, needle_tangent
 from trainer.interactions.crossing import first_crossing, nearest_on_surface
-from trainer.interactions.world import Hole, Place, TipContact, World
+from trainer.interactions.world import Hole, LastSeen, Place, TipContact, World
 
 #: A tip pushed hard but not along itself goes through as well, at this many puncture forces (assumed).
 SIDEWAYS = 2.0
@@ -35,14 +35,15 @@ def detect(world: World, before: Rigid, after: Rigid, start_s: float, span_s: fl
     """Begin a contact where the tip meets a wall on its way from ``before`` to ``after`` (world_from_needle)."""
     if world.contact is not None:
         world.contact.fraction = 0.0
-    if world.tissue is None or world.solver is None or world.contact is not None:
+    if world.tissue is None or world.solver is None or world.contact is not None or world.last_seen is not None:
         return
     triangles = world.surface
-    hit = first_crossing(before.position, after.position, world.before, world.solver.x, triangles, _passed(world))
+    passed_by = passed(world, JUST_THROUGH_MM)
+    hit = first_crossing(before.position, after.position, world.before, world.solver.x, triangles, passed_by)
     if hit is None:
         return
     triangle, fraction, inwards, weights = hit
-    vessel, wall = next(at for at, (first, last) in world.part.items() if first <= triangle < last)
+    vessel, wall = world.wall_of(triangle)
     place = place_on(world, vessel, wall, triangles[triangle], weights)
     normal, _ = world.undented(place)
     slot = world.solver.hold(place.nodes, place.weights)
@@ -146,6 +147,8 @@ def follow_needle(world: World, time_s: float, tool: str) -> None:
         if (arc < 0.0 and outside) or arc < -SLIPPED_MM:
             close(world, hole)
             world.before = world.solver.x.copy()  # out of the hole as the wall lies now
+            if world.last_seen is not None:
+                world.last_seen = LastSeen(world.needle_pose.position, world.before)
             world.emit(Withdraw, time_s, tool, end="tip", **shared)
         elif arc > rear:
             hole.drawn_mm = 0.0
@@ -181,6 +184,17 @@ def place_on(world: World, vessel: int, wall: str, nodes: np.ndarray, weights: A
     return Place(vessel, wall, nodes.astype(np.int32), inside, axial, clock, ring(v, clock, axial))
 
 
+def passed(world: World, arc: float) -> np.ndarray:
+    """Triangles (f,) bool of the walls that touch a hole which is less than ``arc`` mm behind the tip, or ahead of
+    it."""
+    skip = np.zeros(len(world.surface), dtype=np.bool_)
+    for hole in world.open_holes():
+        if hole.arc < arc:
+            first, last = world.part[hole.place.vessel, hole.place.wall]
+            skip[first:last] |= np.isin(world.surface[first:last], hole.place.nodes).any(axis=1)
+    return skip
+
+
 def _arc_through(world: World, at: Array) -> float:
     """Arc (mm) at which the needle passes a point of its own frame; negative ahead of the tip.
 
@@ -205,17 +219,6 @@ def _side(world: World, place: Place) -> float:
 
 def _needle_length(world: World) -> float:
     return world.needle.length if world.needle else 0.0
-
-
-def _passed(world: World) -> np.ndarray:
-    """Triangles (f,) bool of the walls that touch a hole which the tip has only just gone through, or is coming back
-    to."""
-    skip = np.zeros(len(world.surface), dtype=np.bool_)
-    for hole in world.open_holes():
-        if hole.arc < JUST_THROUGH_MM:
-            first, last = world.part[hole.place.vessel, hole.place.wall]
-            skip[first:last] |= np.isin(world.surface[first:last], hole.place.nodes).any(axis=1)
-    return skip
 
 
 def _sticks(world: World, pose: Rigid, normal: Array) -> bool:

@@ -51,6 +51,14 @@ class TipContact:
     normal: Array  # (3,) of the undented wall, at the end of the last movement
 
 
+@dataclass(frozen=True)
+class LastSeen:
+    """Where the needle's tip was before it went a way that nobody saw."""
+
+    tip: Array  # (3,) mm
+    x: Array  # (n, 3) mm, the tissue's nodes then
+
+
 @dataclass
 class Hole:
     """A hole in a wall and what goes through it."""
@@ -125,6 +133,7 @@ class World:
     pieces: Array = field(default_factory=lambda: np.zeros((0, 2)))  # of the thread
     region: Region | None = None
     contact: TipContact | None = None
+    last_seen: LastSeen | None = None  # while the tip is where it cannot have come without a hole
     touched: dict[tuple[int, str], float] = field(default_factory=dict)  # (vessel, wall) → time of the tip's last touch
     holes: list[Hole] = field(default_factory=list)
     passes: int = 0
@@ -153,6 +162,10 @@ class World:
         """The triangles (f, 3) of one wall."""
         first, last = self.part[vessel, wall]
         return self.surface[first:last]
+
+    def wall_of(self, triangle: int) -> tuple[int, str]:
+        """The vessel and the wall that a triangle of ``surface`` belongs to."""
+        return next(at for at, (first, last) in self.part.items() if first <= triangle < last)
 
     def open_holes(self) -> list[Hole]:
         return [h for h in self.holes if h.open]
