@@ -59,9 +59,22 @@ def test_lateness_does_not_add_up(wall: Time) -> None:
 
 
 def test_after_a_long_pause_the_missed_ticks_are_not_run_in_a_burst(wall: Time) -> None:
-    """One second behind is more than LARGEST_LAG_S: the next slots count from now."""
-    begun = begins(clock.Realtime(100.0), wall, [1.0, 1000.0, 1.0, 1.0])
+    """One second behind is more than LARGEST_LAG_S: the next slots count from now, and 0.99 s are told as skipped."""
+    paced = clock.Realtime(100.0)
+    begun = begins(paced, wall, [1.0, 1000.0, 1.0, 1.0])
     assert begun == pytest.approx([0.0, 10.0, 1010.0, 1020.0], abs=1e-5)
+    assert paced.report()["skipped_s"] == pytest.approx(0.99, abs=1e-8)
+
+
+def test_time_lost_between_two_ticks_is_told(wall: Time) -> None:
+    """Half a second between the ticks is no tick's work, but 0.49 s of it have no tick: ``begin`` says so, once."""
+    paced = clock.Realtime(100.0)
+    begins(paced, wall, [1.0])
+    wall.work(499.0)
+    assert paced.begin() == pytest.approx(0.49, abs=1e-8)
+    paced.end()
+    assert paced.begin() == 0.0
+    assert paced.report()["skipped_s"] == pytest.approx(0.49, abs=1e-8)
 
 
 def test_the_first_slot_begins_with_the_first_tick_and_not_with_the_clock(wall: Time) -> None:
@@ -88,6 +101,7 @@ def test_the_report_counts_work_and_not_waiting(kind: type[clock.Fast], wall: Ti
         "p50_ms": pytest.approx(2.0),
         "p99_ms": pytest.approx(9.0),
         "max_ms": pytest.approx(11.0),
+        "skipped_s": 0.0,
     }
 
 
@@ -100,4 +114,5 @@ def test_end_returns_the_work_of_the_tick(wall: Time) -> None:
 
 
 def test_a_session_without_ticks_reports_zeros() -> None:
-    assert clock.Fast(100.0).report() == {"tick_hz": 100.0, "overruns": 0, "p50_ms": 0.0, "p99_ms": 0.0, "max_ms": 0.0}
+    nothing = {"overruns": 0, "p50_ms": 0.0, "p99_ms": 0.0, "max_ms": 0.0, "skipped_s": 0.0}
+    assert clock.Fast(100.0).report() == {"tick_hz": 100.0, **nothing}

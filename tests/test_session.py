@@ -154,9 +154,9 @@ class NotedClock(Fast):
         super().__init__(100.0)
         self._notes = notes
 
-    def begin(self) -> None:
+    def begin(self) -> float:
         self._notes.append("begin")
-        super().begin()
+        return super().begin()
 
     def end(self) -> float:
         self._notes.append("end")
@@ -215,22 +215,41 @@ class SlowTime:
 
 @pytest.mark.parametrize(
     ("clock", "work_ms", "expected"),
-    [(Realtime(100.0), 12.0, 3), (Realtime(100.0), 8.0, 0), (Fast(100.0), 12.0, 0)],
+    [(Realtime(100.0), 12.0, 4), (Realtime(100.0), 8.0, 0), (Fast(100.0), 12.0, 0)],
 )
 def test_an_overrun_is_logged_in_real_time_only(
     clock: Fast, work_ms: float, expected: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Four ticks of 12 ms in slots of 10: each is logged with the tick after it, so the last has none."""
+    """Four ticks of 12 ms in slots of 10: each is logged with the tick after it, the last with itself.
+
+    As many as the clock counts.
+    """
     monkeypatch.setattr("trainer.clock.time", SlowTime(work_ms))
     sink = FakeSink()
     run(FakeScene(4), FakeDriver([poses(0.0)] * 4), [sink], clock)
     found = [event for event in sink.events() if isinstance(event, TickOverrun)]
-    assert [event.tick for event in found] == [1, 2, 3][:expected]
+    assert [event.tick for event in found] == [1, 2, 3, 3][:expected]
+    assert clock.report()["overruns"] == (expected if clock.realtime else 4)
     for event in found:
         assert (event.work_ms, event.slot_ms) == (pytest.approx(work_ms), 10.0)
     keys = [(event.tick, event.seq) for event in sink.events()]
     assert len(set(keys)) == len(keys)
     assert keys == sorted(keys)
+
+
+def test_skipped_time_is_logged(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The hand thinks for a second before tick 5: with that tick it is told that as good as a second has no tick."""
+    wall = SlowTime(0.0)
+    monkeypatch.setattr("trainer.clock.time", wall)
+
+    def think(tick: int) -> None:
+        wall.ns += 10**9 * (tick == 5)
+
+    clock, sink = Realtime(100.0), FakeSink()
+    run(FakeScene(8), FakeDriver([poses(0.0)] * 8, think), [sink], clock)
+    (found,) = [event for event in sink.events() if isinstance(event, TickOverrun)]
+    assert (found.tick, found.work_ms) == (5, 0.0)
+    assert found.skipped_s == clock.report()["skipped_s"] == pytest.approx(0.99)
 
 
 def test_an_error_in_a_sink_ends_the_session_where_it_is() -> None:

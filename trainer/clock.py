@@ -11,8 +11,9 @@ import time
 from array import array
 from collections.abc import Sequence
 
-#: Behind by more than this, a session in real time goes on from where it is (the machine slept, say):
-#: running the missed ticks in a burst would move the scene under the trainee's hands. Assumed.
+#: Behind by more than this, a session in real time goes on from where it is and skips the time between: running the
+#: missed ticks in a burst would move the scene under the trainee's hands. Assumed. A machine that was suspended skips
+#: nothing on Linux, where this clock stands still meanwhile.
 LARGEST_LAG_S = 0.25
 
 
@@ -29,9 +30,12 @@ class Fast:
         self.slot_ms = 1e3 / tick_hz
         self._begun_ns = 0
         self.work_ms = array("d")  # of every tick so far
+        self.skipped_s = 0.0  # time on the wall that no tick stands for
 
-    def begin(self) -> None:
+    def begin(self) -> float:
+        """Wait for the slot of the next tick. Returns how much time, s, was skipped before it."""
         self._begun_ns = time.perf_counter_ns()
+        return 0.0
 
     def end(self) -> float:
         work_ms = (time.perf_counter_ns() - self._begun_ns) * 1e-6
@@ -39,8 +43,8 @@ class Fast:
         return work_ms
 
     def report(self) -> dict[str, float]:
-        """Work per tick, see :func:`pace`."""
-        return pace(self.tick_hz, self.work_ms)
+        """Work per tick, see :func:`pace`, and the time that was skipped."""
+        return {**pace(self.tick_hz, self.work_ms), "skipped_s": self.skipped_s}
 
 
 class Realtime(Fast):
@@ -56,14 +60,20 @@ class Realtime(Fast):
         super().__init__(tick_hz)
         self._due_s = 0.0
 
-    def begin(self) -> None:
+    def begin(self) -> float:
         now = time.perf_counter()
-        if not self.work_ms or now - self._due_s > LARGEST_LAG_S:
+        skipped_s = 0.0
+        if not self.work_ms:
+            self._due_s = now
+        elif now - self._due_s > LARGEST_LAG_S:
+            skipped_s = now - self._due_s
             self._due_s = now
         elif now < self._due_s:
             time.sleep(self._due_s - now)
         self._due_s += 1.0 / self.tick_hz
+        self.skipped_s += skipped_s
         super().begin()
+        return skipped_s
 
 
 def pace(tick_hz: float, work_ms: Sequence[float]) -> dict[str, float]:

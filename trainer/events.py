@@ -254,12 +254,13 @@ class TrackingBack(Event):
 
 @dataclass(frozen=True)
 class TickOverrun(Event):
-    """A tick took longer than its time slot."""
+    """A tick took longer than its time slot, or what lay between it and the next did, and time was skipped."""
 
     kind = "tick_overrun"
     simulated = False
     work_ms: float
     slot_ms: float
+    skipped_s: float = 0.0  # time on the wall that no tick stands for: the session went on from where it was
 
 
 @dataclass(frozen=True)

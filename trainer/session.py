@@ -6,6 +6,7 @@ import gc
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from types import FrameType
 from typing import Any, Protocol
 
@@ -52,20 +53,20 @@ def run(
 
     Where the session ends because the input did or the trainee interrupted it, the closing events come in a
     second record of the last tick. An overrun is logged, in real time only, with the record after it, when its
-    length is known.
+    length is known: that of the last tick in one more record of it.
 
     A device in a hand is asked when the slot of a tick has begun: the newest pose counts. A scripted hand looks at the
     scene and decides, and a file is read, while the slot is waited for; that is no work of the tick.
     """
     poses = scene.home
     tick = 0
-    late_ms = 0.0
+    work_ms, late = 0.0, False
     in_hand = isinstance(driver, LiveDriver)
     seen: ToolPoses | None = None
     while not scene.outcome:
         if not in_hand:
             seen = driver.poll(scene.tick, scene.view())
-        clock.begin()
+        skipped_s = clock.begin()
         if in_hand:
             seen = driver.poll(scene.tick, scene.view())
         if interrupted():
@@ -76,13 +77,17 @@ def run(
             tick = scene.tick
             poses = admit(seen, poses)
             events = scene.step(poses)
-        if late_ms:
-            events = (*events, _overrun(tick, events, late_ms, clock))
+        if late or skipped_s:
+            events = (*events, _overrun(tick, events, work_ms, skipped_s, clock))
         record = TickRecord(tick, tick / clock.tick_hz, poses, events, scene.frame)
         for sink in sinks:
             sink.tick(record)
         work_ms = clock.end()
-        late_ms = work_ms if clock.realtime and work_ms > clock.slot_ms else 0.0
+        late = clock.realtime and work_ms > clock.slot_ms
+    if late:
+        record = replace(record, events=(_overrun(tick, record.events, work_ms, 0.0, clock),))
+        for sink in sinks:
+            sink.tick(record)
 
 
 def admit(seen: ToolPoses, held: ToolPoses) -> ToolPoses:
@@ -105,12 +110,12 @@ def admit(seen: ToolPoses, held: ToolPoses) -> ToolPoses:
     )
 
 
-def _overrun(tick: int, events: tuple[Event, ...], work_ms: float, clock: Fast) -> TickOverrun:
-    """The event that follows ``events``: the tick before took ``work_ms``."""
+def _overrun(tick: int, events: tuple[Event, ...], work_ms: float, skipped_s: float, clock: Fast) -> TickOverrun:
+    """The event that follows ``events``: the tick before took ``work_ms``, and ``skipped_s`` were skipped after it."""
     seq = 0
     if events:
         tick, seq = events[-1].tick, events[-1].seq + 1
-    return TickOverrun(tick, seq, tick / clock.tick_hz, "", work_ms=work_ms, slot_ms=clock.slot_ms)
+    return TickOverrun(tick, seq, tick / clock.tick_hz, "", work_ms=work_ms, slot_ms=clock.slot_ms, skipped_s=skipped_s)
 
 
 @contextmanager

@@ -197,7 +197,8 @@ def describe(event: Event) -> str:
         case TrackingBack():
             return f"seen again after {event.lost_s:.2f} s"
         case TickOverrun():
-            return f"{event.work_ms:.1f} ms of work in {event.slot_ms:.1f} ms"
+            skipped = f", then {event.skipped_s:.2f} s skipped" if event.skipped_s else ""
+            return f"{event.work_ms:.1f} ms of work in {event.slot_ms:.1f} ms{skipped}"
         case TaskStarted():
             return event.task
         case StepDone():
