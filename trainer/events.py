@@ -52,7 +52,11 @@ class Release(Event):
 
 @dataclass(frozen=True)
 class Slip(Event):
-    """The load exceeded what the grip can hold, and the held thing slid out of the jaws."""
+    """The load exceeded what the grip can hold, and the held thing slid out of the jaws.
+
+    ``load_mN`` is that of the tissue's equilibrium. A thread without holes and a needle in two grips are rigid: their
+    load rises until something gives way, and is the limit then.
+    """
 
     kind = "slip"
     target: str
@@ -155,7 +159,7 @@ class Undrape(Event):
 
 @dataclass(frozen=True)
 class Break(Event):
-    """The thread's tension exceeded its strength."""
+    """The thread's tension exceeded its strength: as of a slip, the measured one, or the limit of a rigid thread."""
 
     kind = "break"
     arc_mm: float  # where, along needle and thread from the needle's tip

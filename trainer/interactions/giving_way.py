@@ -116,7 +116,10 @@ def _on_thread(
 
 
 def _draw(world: World, rows: thread_pull.Constraints, first: int, last: int, tension: float, time_s: float) -> bool:
-    """Whether a run of thread gave way: it slips from its weakest grip, or breaks, whichever comes first."""
+    """Whether a run of thread gave way: it slips from its weakest grip, or breaks, whichever comes first.
+
+    Of a rigid run, whose ``tension`` is infinite, the load that is told is the one at which it gave way.
+    """
     spec = world.task.scene.thread
     assert spec is not None
     gripping = [g for g in (rows.grip[first], rows.grip[last]) if g >= 0]
@@ -124,12 +127,14 @@ def _draw(world: World, rows: thread_pull.Constraints, first: int, last: int, te
         gripping.append(leader)
     weakest = min(gripping, key=lambda i: grasp.capacity_mN(world, i))
     limit, strength = grasp.capacity_mN(world, weakest), spec.strength_mN.value
-    if tension <= min(limit, strength):
+    bears = min(limit, strength)
+    if tension <= bears:
         return False
+    load = bears if math.isinf(tension) else tension
     if limit <= strength:
-        grasp.slip(world, weakest, min(tension, limit), limit, time_s)
+        grasp.slip(world, weakest, load, limit, time_s)
     else:
-        thread_pull.snap(world, 0.5 * float(rows.arc[first] + rows.arc[first + 1]), min(tension, strength), time_s)
+        thread_pull.snap(world, 0.5 * float(rows.arc[first] + rows.arc[first + 1]), load, time_s)
     return True
 
 

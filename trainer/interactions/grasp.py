@@ -102,7 +102,10 @@ def pressure_kPa(world: World, tool: int) -> float:
 
 
 def second_grips(world: World, time_s: float) -> None:
-    """The needle follows the instrument that leads it; another one loses it when they drift apart."""
+    """The needle follows the instrument that leads it; another one loses it when they drift apart.
+
+    Two grips of one needle are rigid, so that the load rises until this one slips: at its limit.
+    """
     leader = world.needle_tool()
     for i, jaw in enumerate(world.jaws):
         if jaw.target == "needle" and i != leader and jaw.tool_from_needle is not None:
