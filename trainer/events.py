@@ -183,7 +183,7 @@ class Tear(Event):
 
 @dataclass(frozen=True)
 class Cut(Event):
-    """Blades closed through a structure: one stroke, written when they stop closing."""
+    """Blades closed through a structure: one stroke, written when they are closed or open again."""
 
     kind = "cut"
     body: str

@@ -45,7 +45,7 @@ def _handled(region: Region, step: Step) -> bool:
             tacked = elements[region.tacked[elements]]
             return len(tacked) > 0 and region.displaced_mm(tacked) >= step.at_least_mm
         case "cut":
-            return step.structure in region.severed and not any(region.strokes)
+            return step.structure in region.severed and not any(blades.cut for blades in region.blades)
         case _:
             return region.parted_mm(step.structure) >= step.at_least_mm
 

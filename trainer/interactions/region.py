@@ -47,10 +47,12 @@ class Hold:
 
 
 @dataclass
-class Stroke:
-    """What the blades of one instrument have cut since they began to close, by structure."""
+class Blades:
+    """How far the blades of one instrument have closed, or opened, and what this stroke of them has cut."""
 
-    elements: dict[str, list[Indices]] = field(default_factory=dict)
+    closing: bool = False
+    closure: float = 0.0  # the greatest since they began to close; while they open, the least
+    cut: dict[str, list[Indices]] = field(default_factory=dict)  # by structure, in this stroke
 
 
 @dataclass
@@ -81,7 +83,7 @@ class Region:
     names: dict[int, str]  # of the labels
     elements: dict[str, Indices]  # of each movable structure
     held: list[Hold | None]  # by instrument
-    strokes: list[Stroke | None]  # by instrument, while its blades close
+    blades: list[Blades]  # by instrument
     inside: list[str]  # by instrument: the structure that its tip is in or a probe's touches, or ""
     touch: list[Touch]  # by instrument
     hard: DensityField | None  # the field of what is rigid, for probes
@@ -205,7 +207,7 @@ def build(task: Task, spec: AnatomySpec, anatomy: Anatomy | None = None) -> Regi
         names={s.number: name for name, s in structures().items()},
         elements=elements,
         held=[None] * instruments,
-        strokes=[None] * instruments,
+        blades=[Blades() for _ in range(instruments)],
         inside=[""] * instruments,
         touch=[Touch() for _ in range(instruments)],
         hard=_hard(spec, labels, spacing, corner),

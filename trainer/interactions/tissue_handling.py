@@ -13,12 +13,16 @@ from trainer.events import Cut, Grasp, Probe, Release, Slip, Tack, Tear
 from trainer.geometry import Array
 from trainer.instruments.arthroscopic import edges
 from trainer.interactions import giving_way, grasp, portal, probing
-from trainer.interactions.region import LOOSE, Hold, Region, Stroke
+from trainer.interactions.region import LOOSE, Hold, Region
 from trainer.interactions.world import World
 from trainer.mechanics.elastic_relaxation import force_on, relax
 from trainer.mechanics.incision import cut, tear
 from trainer.mechanics.volume import Indices, tack, untack
 from trainer.mechanics.volume_drag import drag
+
+#: Blades turn round when their closure has come back by so much: 2 degrees of the 45 between them, ten counts of a
+#: closure sensor of eight bits. Assumed.
+DEAD_BAND = 0.05
 
 
 def move(world: World, closures: Array, start_s: float, span_s: float) -> None:
@@ -125,41 +129,43 @@ def _keep_limits_at_tacks(region: Region) -> None:
 
 
 def _snip(world: World, region: Region, tool: int, closure: float, time_s: float) -> None:
-    """Blades that close cut what lies between them; a stroke ends when they stop."""
-    jaw = world.jaws[tool]
-    stroke = region.strokes[tool]
-    if closure <= jaw.closure:
-        if stroke is not None:
-            _end_stroke(world, region, tool, stroke, time_s)
-        return
-    stroke = region.strokes[tool] = stroke or Stroke()
-    pose = region.in_layer(jaw.pose)
-    for before, after in zip(edges(pose, jaw.closure), edges(pose, closure), strict=True):
-        change = cut(region.volume, region.state, before - region.origin, after - region.origin)
-        for structure, lost in region.note(change).items():
-            stroke.elements.setdefault(structure, []).append(lost)
-    if closure == 1.0:
-        _end_stroke(world, region, tool, stroke, time_s)
+    """Blades that close cut what lies between them, from where they began to close on.
+
+    One stroke lasts until they have opened by DEAD_BAND: a sample that comes twice, or trembles, neither ends nor
+    begins one.
+    """
+    blades, jaw = region.blades[tool], world.jaws[tool]
+    if blades.closing and closure < blades.closure - DEAD_BAND:
+        _end_stroke(world, region, tool, time_s)
+        blades.closing, blades.closure = False, closure
+    elif not blades.closing and closure <= blades.closure + DEAD_BAND:
+        blades.closure = min(blades.closure, closure)
+    elif closure > blades.closure:
+        pose = region.in_layer(jaw.pose)
+        for before, after in zip(edges(pose, blades.closure), edges(pose, closure), strict=True):
+            change = cut(region.volume, region.state, before - region.origin, after - region.origin)
+            for structure, lost in region.note(change).items():
+                blades.cut.setdefault(structure, []).append(lost)
+        blades.closing, blades.closure = True, closure
+        if closure == 1.0:
+            _end_stroke(world, region, tool, time_s)
 
 
 def end_strokes(world: World, time_s: float) -> None:
     """Write what was cut by blades that are still closing: the exercise is over."""
-    region = world.region
-    if region is None:
-        return
-    for i, stroke in enumerate(region.strokes):
-        if stroke is not None:
-            _end_stroke(world, region, i, stroke, time_s)
+    if world.region is not None:
+        for i in range(len(world.tools)):
+            _end_stroke(world, world.region, i, time_s)
 
 
-def _end_stroke(world: World, region: Region, tool: int, stroke: Stroke, time_s: float) -> None:
-    region.strokes[tool] = None
-    for structure, pieces in stroke.elements.items():
+def _end_stroke(world: World, region: Region, tool: int, time_s: float) -> None:
+    for structure, pieces in region.blades[tool].cut.items():
         lost = np.unique(np.concatenate(pieces))
         world.emit(
             Cut, time_s, world.tools[tool], body=structure,
             point=world.place_in_world(region.rest(lost).mean(axis=0)), volume_mm3=region.mm3(lost),
         )  # fmt: skip
+    region.blades[tool].cut.clear()
 
 
 def _tear(world: World, region: Region, time_s: float) -> None:
