@@ -246,6 +246,8 @@ class Step:
 
 #: Kinds of steps that handle a structure of the anatomy.
 TISSUE_STEPS = ("grasp", "pull", "tack", "cut", "retract")
+#: Those for which a structure is to be cut through, between what it is grown to.
+SEVERING_STEPS = ("cut", "retract")
 
 
 @dataclass(frozen=True)
@@ -289,10 +291,15 @@ class Task:
                 raise ValueError(f"step '{s.name}' names no vessel of the scene: {s.vessel!r}")
             if s.kind == "drive" and s.bite_mm > vessels[s.vessel].length_mm:
                 raise ValueError(f"step '{s.name}': 'bite_mm' must not exceed the vessel's 'length_mm'")
-        movable = [t.structure for t in self.scene.anatomy.tissue] if self.scene.anatomy else []
+        movable = {t.structure: t for t in self.scene.anatomy.tissue} if self.scene.anatomy else {}
         for s in self.step:
             if s.kind in TISSUE_STEPS and s.structure not in movable:
                 raise ValueError(f"step '{s.name}' names no movable structure of the scene: {s.structure!r}")
+            if s.kind in SEVERING_STEPS and len(set(movable[s.structure].grown_to)) < 2:
+                raise ValueError(
+                    f"step '{s.name}' cuts through what lies between two structures: "
+                    f"'grown_to' of the {s.structure} must name both"
+                )
             if s.kind == "probe" and (not movable or all(i.kind != "probe" for i in self.scene.instrument)):
                 raise ValueError(f"step '{s.name}' needs an 'anatomy' and an instrument of kind 'probe'")
         if not self.step:

@@ -10,7 +10,7 @@ from trainer.anatomy import block, library, section
 from trainer.anatomy.imported import Anatomy
 from trainer.anatomy.structures import number_of, structures
 from trainer.config import ConfigError
-from trainer.curriculum import AnatomySpec, Task, TissueSpec
+from trainer.curriculum import SEVERING_STEPS, AnatomySpec, Task, TissueSpec
 from trainer.geometry import Array, Rigid, lengthwise
 from trainer.mechanics import volume as volumes
 from trainer.mechanics.density_field import DensityField, density_field
@@ -89,7 +89,8 @@ class Region:
     hard: DensityField | None  # the field of what is rigid, for probes
     tacked: np.ndarray  # (n,) bool, fixed by a tack
     opened: dict[str, Indices] = field(default_factory=dict)  # elements of a structure that lost a link
-    severed: set[str] = field(default_factory=set)  # structures that hold together no more
+    bridges: frozenset[str] = frozenset()  # structures that lead from one of what they are grown to to another at rest
+    severed: set[str] = field(default_factory=set)  # those of them that do so no more
     torn_through: str = ""  # the first structure that was severed by a pull
     pull_max_mN: float = 0.0
     press_max_mN: float = 0.0  # the greatest force on the tip of a probe
@@ -132,17 +133,18 @@ class Region:
         found = {s: lost for s, lost in found.items() if len(lost)}
         for structure, lost in found.items():
             self.opened[structure] = np.union1d(self.opened.get(structure, lost), lost).astype(np.int32)
-        if found:
-            self._note_severed()
+        self.severed |= {s for s in found if s in self.bridges and not self.leads_through(s)}
         return found
 
-    def _note_severed(self) -> None:
-        labels = self.volume.labels.reshape(-1)
-        parts = [np.unique(labels[part]) for part in islands(self.state, self.volume)]
-        for structure, spec in self.tissue.items():
-            ends = [number_of(end) for end in spec.grown_to]
-            if not any(np.isin(ends, part).sum() > 1 for part in parts):
-                self.severed.add(structure)
+    def leads_through(self, structure: str) -> bool:
+        """Whether a way through ``structure`` alone leads from one of what it is grown to to another."""
+        labels, strides = self.volume.labels.reshape(-1), grid_strides(self.volume)
+        ends = [number_of(end) for end in self.tissue[structure].grown_to]
+        for part in islands(self.state, self.volume, number_of(structure)):
+            linked = [part[(self.state.links[part] & (1 << d)) != 0] + strides[d] for d in range(len(STEPS))]
+            if np.isin(ends, labels[np.concatenate(linked)]).sum() > 1:
+                return True
+        return False
 
     def parted_mm(self, structure: str) -> float:
         """How far the cut ends of a severed structure have moved apart, mm; 0 as long as it holds together.
@@ -152,7 +154,7 @@ class Region:
         if structure not in self.severed:
             return 0.0
         part = np.empty(self.volume.labels.size, dtype=np.int32)
-        for number, elements in enumerate(islands(self.state, self.volume)):
+        for number, elements in enumerate(islands(self.state, self.volume, number_of(structure))):
             part[elements] = number
         opened, u = self.opened[structure], self.state.u
         gaps = []
@@ -196,7 +198,7 @@ def build(task: Task, spec: AnatomySpec, anatomy: Anatomy | None = None) -> Regi
             if structures()[structure].kind == "ligament":
                 _lay_against_bone(volume, state, own)
     instruments = len(task.scene.instrument)
-    return Region(
+    region = Region(
         volume=volume,
         state=state,
         origin=corner + lowest * np.array(spacing),
@@ -213,6 +215,14 @@ def build(task: Task, spec: AnatomySpec, anatomy: Anatomy | None = None) -> Regi
         hard=_hard(spec, labels, spacing, corner),
         tacked=np.zeros(part.size, dtype=bool),
     )
+    region.bridges = frozenset(structure for structure in elements if region.leads_through(structure))
+    for step in task.step:
+        if step.kind in SEVERING_STEPS and step.structure not in region.bridges:
+            ends = " and ".join(region.tissue[step.structure].grown_to)
+            raise ConfigError(
+                f"anatomy '{name}': the {step.structure} does not join {ends}, so that it cannot be cut through"
+            )
+    return region
 
 
 def _hard(spec: AnatomySpec, labels: np.ndarray, spacing: Triple, corner: Array) -> DensityField | None:

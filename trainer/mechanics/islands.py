@@ -45,8 +45,12 @@ def _flood(links, strides, begin, ends, reached, queue, starts):  # type: ignore
     return count
 
 
-def islands(state: VolumeState, volume: Volume) -> list[Indices]:
-    """The elements of each connected part, in the order of their lowest element, sorted."""
+def islands(state: VolumeState, volume: Volume, label: int | None = None) -> list[Indices]:
+    """The elements of each connected part, in the order of their lowest element, sorted.
+
+    With a ``label`` only ways through elements of that label count, and only those are told.
+    """
+    passed_over = np.zeros(volume.labels.size, np.bool_) if label is None else volume.labels.reshape(-1) != label
     n = volume.labels.size
     pairs = np.concatenate([state.seams.ends, state.seams.ends[:, ::-1]])
     pairs = pairs[np.argsort(pairs[:, 0], kind="stable")]
@@ -57,7 +61,7 @@ def islands(state: VolumeState, volume: Volume) -> list[Indices]:
         grid_strides(volume),
         begin,
         np.ascontiguousarray(pairs[:, 1]),
-        np.zeros(n, np.bool_),
+        passed_over,
         queue,
         starts,
     )
