@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 import signal
@@ -9,9 +10,12 @@ import sqlite3
 import subprocess
 import sys
 import tempfile
+import threading
 import time
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -143,6 +147,15 @@ def test_a_session_id_is_used_once(path: Path) -> None:
         LogSink(path, header(SESSION))
 
 
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Another program holds a transaction in which it writes."""
+    with closing(sqlite3.connect(path, isolation_level=None)) as other:
+        other.execute("begin immediate")
+        yield
+        other.execute("rollback")
+
+
 def go_on(sink: LogSink, tick: int) -> None:
     """Many more ticks, at a pace that a writer can follow."""
     for later in range(tick, tick + 5000):
@@ -173,6 +186,60 @@ def test_a_session_that_was_closed_elsewhere_is_not_written_any_more(path: Path)
             go_on(sink, 1)
     execute(path, "update sessions set status = 'running'")
     assert stored_events(path)[0] == pierce(0)
+
+
+def retried(monkeypatch: pytest.MonkeyPatch, times: int) -> threading.Event:
+    """Set when the writer has failed to commit so often, for whatever reason."""
+    failures, commit, enough = itertools.count(1), LogSink._commit, threading.Event()
+
+    def counted(sink: LogSink, *given: Any) -> None:
+        try:
+            commit(sink, *given)
+        except sqlite3.Error:
+            if next(failures) == times:
+                enough.set()
+            raise
+
+    monkeypatch.setattr(LogSink, "_commit", counted)
+    return enough
+
+
+def test_a_log_that_another_program_locks_for_a_while_loses_nothing(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A database browser, a migration. What comes meanwhile, and events that matter, wait in memory."""
+    enough = retried(monkeypatch, 3)
+    with closing(LogSink(path, header(SESSION))) as sink:
+        with locked(path):
+            for tick in range(300):
+                sink.tick(step(tick, pierce(tick)))
+            assert enough.wait(60.0)
+            sink.tick(step(300, pierce(300)))
+            assert sink.waiting == 301
+        sink.tick(step(301))
+        sink.finish("completed", "", 302, 3.02, None, None, METRICS)
+    with open_log(path) as db:
+        record = reader.load(db, SESSION)
+        assert seal.check(db) == []
+    assert (record.status, record.ticks, len(record.position)) == ("ended", 302, 302)
+    assert list(record.events) == [pierce(t) for t in range(301)]
+
+
+def test_a_log_that_stays_locked_is_told_in_one_line_and_keeps_what_was_written(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(log, "PATIENCE_S", 0.05)
+    with closing(LogSink(path, header(SESSION))) as sink:
+        sink.tick(step(0, pierce(0)))
+        wait_for_events(path, 1)
+        with locked(path):
+            sink.tick(step(1, pierce(1)))
+            with pytest.raises(LogError, match=f"^{path}: locked by another program; end that one"):
+                sink.finish("completed", "", 2, 0.02, None, None, ())
+    execute(path, "update sessions set heartbeat = heartbeat - ?", (STALE_S + 1.0,))
+    with open_log(path) as db:
+        assert [i.ticks for i in recover(db)] == [1]
+        assert seal.check(db) == []
 
 
 @pytest.mark.parametrize("place", ["file/s.db", "file/deeper/s.db", "."])

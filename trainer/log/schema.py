@@ -199,6 +199,8 @@ def _reason(error: sqlite3.Error) -> str:
         return "the disk refuses to write or read (full, over quota or gone)"
     if name.startswith("SQLITE_CANTOPEN"):
         return "cannot be made or opened here; name another log"
+    if name.startswith(("SQLITE_BUSY", "SQLITE_LOCKED")):
+        return "locked by another program; end that one, or what it does with the log"
     if name.startswith("SQLITE_NOTADB"):
         return "not a log: not an SQLite file"
     if name.startswith("SQLITE_CORRUPT"):

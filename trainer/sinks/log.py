@@ -2,7 +2,7 @@
 
 The session only puts plain values into a queue. The thread commits them at least every 100 ms, sooner after 256
 rows or an event that matters; each batch is one transaction, so that whatever ends the program costs 100 ms at
-the most and never an earlier batch.
+the most and never an earlier batch. While another program has locked the log, batches wait in memory.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import sqlite3
 import threading
 import time
 import zlib
@@ -32,6 +33,7 @@ from trainer.sinks.surface import TickRecord
 BATCH_S = 0.1
 BATCH_ROWS = 256
 BEAT_S = 1.0  # at least so often the session says that it is alive
+PATIENCE_S = 30.0  # so long a session that ends waits for another program that has locked the log
 URGENT = frozenset({"task_started", "pierce", "drop", "break", "tear", "overforce", "step_done", "task_done"})
 
 
@@ -52,6 +54,7 @@ class LogSink:
         self._id = header.id
         self._last_tick: int | None = None
         self._queue: SimpleQueue[_Written] = SimpleQueue()
+        self._batch: list[_Written] = []  # taken from the queue, not committed yet
         self._wake = threading.Event()
         self._stopping = False
         self._closed = False
@@ -79,7 +82,7 @@ class LogSink:
     @property
     def waiting(self) -> int:
         """How many ticks are not written yet."""
-        return self._queue.qsize()
+        return self._queue.qsize() + len(self._batch)
 
     def record(self, outcome: str, ticks: int, duration_s: float) -> SessionRecord:
         """The session as the log will hold it once it is finished so; no tick may follow. Raises LogError.
@@ -118,6 +121,7 @@ class LogSink:
         }
         with open_log(self._path) as db, clear_errors(self._path):
             db.conn.execute("pragma synchronous = full")  # the end of a session outlives a power cut
+            _wait_for_others(db, PATIENCE_S)
             with db.atomic():
                 self._claim(db, 0)
                 table(db, "sessions").update(self._id, end)
@@ -131,6 +135,7 @@ class LogSink:
         self._closed = True
         self._stop()
         with open_log(self._path) as db, clear_errors(self._path):
+            _wait_for_others(db, PATIENCE_S)
             abort(db, self._id, INTERRUPTED)
 
     def _stop(self) -> None:
@@ -154,9 +159,16 @@ class LogSink:
                     self._wake.wait(BATCH_S)
                     self._wake.clear()
                     stopping = self._stopping  # read before the queue: nothing is put after it is set
-                    batch = self._taken()
-                    if batch or time.monotonic() - beat > BEAT_S:
-                        self._commit(db, batch)
+                    self._batch += self._taken()
+                    if self._batch or time.monotonic() - beat > BEAT_S:
+                        _wait_for_others(db, PATIENCE_S if stopping else BATCH_S)
+                        try:
+                            self._commit(db, self._batch)
+                        except sqlite3.OperationalError as error:
+                            if stopping or not _locked(error):
+                                raise
+                            continue  # with the same batch, and what has come meanwhile
+                        self._batch = []
                         beat = time.monotonic()
         except LogError as error:
             self._error = error
@@ -213,6 +225,16 @@ def _start(db: Database, header: SessionHeader) -> None:
         table(db, "trainees").insert({"name": header.trainee}, ignore=True)
         trainee = next(db.query("select id from trainees where name = ?", [header.trainee]))["id"]
         table(db, "sessions").insert(row | {"trainee": trainee})
+
+
+def _wait_for_others(db: Database, seconds: float) -> None:
+    """How long a statement waits for another program's lock."""
+    db.conn.execute(f"pragma busy_timeout = {round(1e3 * min(seconds, PATIENCE_S))}")
+
+
+def _locked(error: sqlite3.OperationalError) -> bool:
+    """Whether a statement failed because another program has locked the log: it can succeed later."""
+    return error.sqlite_errorname.startswith(("SQLITE_BUSY", "SQLITE_LOCKED"))
 
 
 def _json(value: Mapping[str, Any] | Sequence[str] | None) -> str | None:
