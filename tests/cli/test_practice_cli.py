@@ -12,6 +12,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -34,8 +35,10 @@ from trainer.profile import Hand
 from trainer.reporting.session import MetricRow
 from trainer.scene import build
 from trainer.session import run
+from trainer.sinks import recording
 from trainer.sinks.recording import RecordingSink
 from trainer.sinks.rrd_file import RecordingError
+from trainer.sinks.surface import TickRecord
 
 CommandLine = Callable[..., tuple[int, str, str]]
 TICKS = 33
@@ -72,9 +75,10 @@ def test_the_document_says_all_that_the_contract_asks(command_line: CommandLine,
     assert tissue == asdict(choose_tissue(curriculum.load_task(str(task)).task, str(task)))
     assert tissue["measured_error_mm"] <= tissue["budget"]["node_error_mm"] == 0.003
     assert (found["methods"]["thread"]["method"], found["methods"]["thread"]["links"]) == ("follow the leader", 100)
-    recording = db.parent / "recordings" / f"{found['session']}.rrd"
-    assert found["recording"] == str(recording)
-    assert recording.stat().st_size > 0
+    rrd = db.parent / "recordings" / f"{found['session']}.rrd"
+    assert found["recording"] == str(rrd)
+    assert rrd.stat().st_size > 0
+    assert found["dropped_frames"] == 0
 
 
 def test_what_is_printed_is_what_the_log_holds(command_line: CommandLine, task: Path, tmp_path: Path) -> None:
@@ -331,6 +335,31 @@ def test_a_recording_that_fails_costs_only_itself(
     assert (code, err) == (1, f"trainer: {rrd}: cannot write the recording: No space left on device\n")
     with open_log(db) as log:
         assert reader.summary(log, json.loads(out)["session"]).outcome == "timeout"
+
+
+def test_pictures_that_a_busy_machine_left_out_are_told(
+    command_line: CommandLine, task: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The recorder is stuck at the first of nine pictures, one every 4 ticks, and has room for no other but the last,
+    which is waited for."""
+    monkeypatch.setattr(recording, "FRAMES_WAITING", 1)
+    write, tick, last = RecordingSink._write, RecordingSink.tick, threading.Event()
+
+    def stuck(sink: RecordingSink, moment: Any) -> None:
+        last.wait()
+        write(sink, moment)
+
+    def told(sink: RecordingSink, record: TickRecord) -> None:
+        if record.tick == TICKS - 1:
+            last.set()
+        tick(sink, record)
+
+    monkeypatch.setattr(RecordingSink, "_write", stuck)
+    monkeypatch.setattr(RecordingSink, "tick", told)
+    code, out, err = command_line("practice", task, "--db", tmp_path / "log.db", "--json")
+    assert code == 0
+    assert json.loads(out)["dropped_frames"] == 7
+    assert err == ("trainer: the machine was too busy: the recording lacks 7 of its pictures; the log lacks nothing\n")
 
 
 def test_a_session_that_was_killed_is_announced_and_the_next_one_starts(

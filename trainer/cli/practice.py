@@ -74,6 +74,9 @@ def practice(
             from trainer.cli.scores import print_result
 
             print_result(result, task_file.task)
+        if result["dropped_frames"]:
+            lacks = f"the recording lacks {result['dropped_frames']} of its pictures; the log lacks nothing"
+            typer.echo(f"trainer: the machine was too busy: {lacks}", err=True)
     # A recording that could not be finished says so here, when everything else is stored and printed.
 
 
@@ -175,6 +178,7 @@ def perform(
         "metrics": [asdict(metric) for metric in metrics],
         "out_of_sight": out_of_sight(stored.events),
         "recording": None if recording_path is None else str(recording_path),
+        "dropped_frames": 0 if recording is None else recording.dropped_frames,
         "log": str(log_path),
         "methods": {
             "tissue": None if tissue is None else asdict(tissue),
