@@ -6,10 +6,12 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from trainer.anatomy import imported, library
 from trainer.anatomy.label_volume import LabelVolume, write_nrrd
+from trainer.anatomy.structures import number_of
 from trainer.curriculum import load_task
 
 CommandLine = Callable[..., tuple[int, str, str]]
@@ -73,6 +75,29 @@ def test_the_tasks_own_knee_is_stored_by_its_name(command_line: CommandLine, tas
     code, out, _ = practised(command_line, db, task)
     assert (code, json.loads(out)["anatomy"]) == (0, "knee")
     assert command_line("sessions", "replay", "last", "--verify", "--db", db)[0] == 0
+
+
+def test_a_task_with_vessels_as_well_takes_place_in_the_named_knee_too(
+    command_line: CommandLine, folder: Path, tmp_path: Path
+) -> None:
+    """Its steps drive a needle and name no structure. A knee without the ligament that is to move is refused."""
+    knee = load_task("arthroscopy/probe-landmarks").text.replace("voxel_mm = 1.0", "voxel_mm = 2.0")
+    knee = knee[knee.index("[scene.anatomy]") : knee.index("[[scene.instrument]]")]
+    text = load_task("anastomosis/needle-drive").text.replace("time_limit_s = 300.0", "time_limit_s = 0.1")
+    text = text.replace("layers = 21", "layers = 9").replace("around = 24", "around = 8")
+    both, db = tmp_path / "both.toml", tmp_path / "log.db"
+    both.write_text(f"{text}\n{knee}")
+    code, out, err = practised(command_line, db, both, "--anatomy", folder)
+    assert (code, err) == (0, "")
+    found = json.loads(out)
+    assert (found["anatomy"], found["ticks"]) == (str(folder), 10)
+    assert command_line("sessions", "replay", "last", "--verify", "--db", db)[0] == 0
+    kept = imported.load(folder).volume
+    without = np.where(kept.labels == number_of("anterior cruciate ligament"), 0, kept.labels).astype(np.uint8)
+    write_nrrd(LabelVolume(without, kept.spacing_mm, kept.lps_from_volume), folder / imported.LABELS)
+    code, out, err = practised(command_line, db, both, "--anatomy", folder)
+    assert (code, out) == (1, "")
+    assert "anatomy 'my knee' has no anterior cruciate ligament" in err
 
 
 @pytest.mark.parametrize(

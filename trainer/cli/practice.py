@@ -128,7 +128,7 @@ def perform(
         _make_room(recording_path)
     _close_interrupted(log_path)
     announce()
-    scene = build(task, anatomy=knee) if tissue is None else build(task, tissue.tolerance_mN)
+    scene = build(task, **({} if tissue is None else {"tolerance_mN": tissue.tolerance_mN}), anatomy=knee)
     session = stack.enter_context(ExitStack())
     session.enter_context(stdout_kept())  # a device's library may print whenever it opens it again
     profile, driver = open_driver(device, task, scene.home, seed)

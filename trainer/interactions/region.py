@@ -10,7 +10,7 @@ from trainer.anatomy import block, library, section
 from trainer.anatomy.imported import Anatomy
 from trainer.anatomy.structures import number_of, structures
 from trainer.config import ConfigError
-from trainer.curriculum import SEVERING_STEPS, AnatomySpec, Task, TissueSpec
+from trainer.curriculum import SEVERING_STEPS, TISSUE_STEPS, AnatomySpec, Task, TissueSpec
 from trainer.geometry import Array, Rigid, lengthwise
 from trainer.mechanics import volume as volumes
 from trainer.mechanics.density_field import DensityField, density_field
@@ -171,7 +171,8 @@ def build(task: Task, spec: AnatomySpec, anatomy: Anatomy | None = None) -> Regi
 
     Raises ConfigError for an anatomy or structures that are not there.
     """
-    needed = dict.fromkeys([t.structure for t in spec.tissue] + [s.structure for s in task.step])
+    handled = [s.structure for s in task.step if s.kind in (*TISSUE_STEPS, "probe")]
+    needed = dict.fromkeys([t.structure for t in spec.tissue] + handled)
     for structure in (*needed, *(end for t in spec.tissue for end in t.grown_to)):
         if structure not in structures():
             raise ConfigError(f"unknown structure '{structure}'; known: {', '.join(structures())}")
