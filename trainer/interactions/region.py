@@ -122,6 +122,12 @@ class Region:
             return ""
         return self.names.get(int(self.labels[tuple(index)]), "")
 
+    def beside(self, elements: Indices, axis: int, steps: int) -> Indices:
+        """The elements (k,) so many steps along an axis from ``elements`` (k,), or -1 beyond the volume's side."""
+        stride, count = self.volume.strides[axis], self.volume.shape[axis]
+        at = elements // stride % count + steps
+        return np.where((at >= 0) & (at < count), elements + steps * stride, -1).astype(np.int32)
+
     def mm3(self, elements: Indices) -> float:
         """What ``elements`` (k,) take up at rest."""
         return float(len(elements) * self.volume.element_mm3)
@@ -158,10 +164,12 @@ class Region:
             part[elements] = number
         opened, u = self.opened[structure], self.state.u
         gaps = []
-        for step in self.volume.strides:
-            pairs = opened[np.isin(opened + step, opened)]
-            apart = pairs[part[pairs] != part[pairs + step]]
-            gaps.append(np.linalg.norm(u[:, apart + step] - u[:, apart], axis=0))
+        for axis in range(3):
+            beside = self.beside(opened, axis, 1)
+            both = np.isin(beside, opened)
+            a, b = opened[both], beside[both]
+            apart = part[a] != part[b]
+            gaps.append(np.linalg.norm(u[:, b[apart]] - u[:, a[apart]], axis=0))
         found = np.concatenate(gaps)
         return float(found.mean()) if len(found) else 0.0
 

@@ -33,7 +33,7 @@ def uncut_at(region: Region, structure: str, place: Array) -> Indices:
         level = level[(region.state.links[level + k * region.volume.strides[axis]] & both) == both]
     opened = region.opened.get(structure, np.empty(0, np.int32))
     steps = range(-round(LEVEL_MM / h), round(LEVEL_MM / h) + 1)
-    return np.asarray(level[~np.any([np.isin(level + k * region.volume.strides[axis], opened) for k in steps], axis=0)])
+    return np.asarray(level[~np.any([np.isin(region.beside(level, axis, k), opened) for k in steps], axis=0)])
 
 
 def in_sight(region: Region, structure: str, eye: Array) -> Array | None:
