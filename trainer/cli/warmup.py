@@ -34,7 +34,7 @@ def announce() -> None:
 
 
 def warm_up(task: Task, anatomy: Anatomy | None = None) -> None:
-    """Perform ``task`` with no sinks, so that every kernel is in memory when the clock starts.
+    """Perform ``task`` with no sinks, so that every kernel is in memory, and every thread there, when the clock starts.
 
     Kernels are compiled for types and not for sizes: a coarse mesh, long ticks and a hasty hand meet all of them
     in a second or two, whatever becomes of the stitch.
@@ -43,10 +43,12 @@ def warm_up(task: Task, anatomy: Anatomy | None = None) -> None:
 
     from trainer.clock import Fast
     from trainer.drivers import scripted_hands
+    from trainer.mechanics import sharing
     from trainer.profile import Hand
     from trainer.scene import build
     from trainer.session import run
 
+    sharing.start()
     vessels = tuple(replace(vessel, layers=9, around=8) for vessel in task.scene.vessel)
     coarse = replace(task, scene=replace(task.scene, vessel=vessels), tick_hz=20.0)
     scene = build(coarse, anatomy=anatomy)

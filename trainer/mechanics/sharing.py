@@ -11,6 +11,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from itertools import pairwise
+from threading import Barrier
 from typing import TypeVar
 
 T = TypeVar("T")
@@ -32,7 +33,18 @@ def _threads() -> int:
 
 @cache
 def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(_threads(), thread_name_prefix="volume")
+    return ThreadPoolExecutor(MOST_THREADS - 1, thread_name_prefix="volume")
+
+
+def start() -> None:
+    """Count the cores and start the threads, before the caller takes a core to itself: afterwards it would see and
+    give to new threads no other."""
+    _threads()
+    all_there = Barrier(MOST_THREADS)
+    waiting = [_pool().submit(all_there.wait) for _ in range(MOST_THREADS - 1)]
+    all_there.wait()
+    for one in waiting:
+        one.result()
 
 
 def parts(begin: int, end: int, elements: int) -> list[tuple[int, int]]:
@@ -44,7 +56,6 @@ def parts(begin: int, end: int, elements: int) -> list[tuple[int, int]]:
 
 
 def share_out(work: Callable[[tuple[int, int]], T], pieces: list[tuple[int, int]]) -> list[T]:
-    """``work`` for each piece, at the same time; results in the pieces' order."""
-    if len(pieces) == 1:
-        return [work(pieces[0])]
-    return list(_pool().map(work, pieces))
+    """``work`` for each piece, at the same time, the first one by the caller; results in the pieces' order."""
+    others = [_pool().submit(work, piece) for piece in pieces[1:]]
+    return [work(pieces[0]), *(other.result() for other in others)]
