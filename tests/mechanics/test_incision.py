@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from volume_samples import SPACING, block, check_structure, material, random_shape, seeds, worst_violation
+from volume_samples import SPACING, block, check_structure, in_cell, material, random_shape, seeds, worst_violation
 
 from trainer.mechanics.elastic_relaxation import relax
 from trainer.mechanics.incision import cut, erase, overstretched, tear
@@ -292,7 +292,7 @@ def test_whatever_is_done_elements_links_and_cells_add_up(seed: int, actions: li
         cells.update(0, at)
         seen: dict[int, int] = {}
         for cell in {cells.cell_of(s) for s in range(len(everything))} - {-1}:
-            for s in cells.in_cell(cell):
+            for s in in_cell(cells, cell):
                 assert s not in seen
                 seen[s] = cell
         inside = np.all((at >= -9.0) & (at < 12.0), axis=1)

@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 from hypothesis import given
-from volume_samples import block, material, seeds
+from volume_samples import block, in_cell, material, seeds
 
-from trainer.geometry import Rigid, quaternion_from_axis_angle
-from trainer.mechanics.contact_response import Region, push, push_out, region, separate, surface_normals
+from trainer.geometry import Array, Rigid, quaternion_from_axis_angle
+from trainer.mechanics.contact_response import Region, push, push_out, region, surface_normals
 from trainer.mechanics.occupancy import APART, OccupancyMap, surface_elements
 from trainer.mechanics.volume import build, places, start
 from trainer.mechanics.volume_drag import drag
@@ -36,7 +36,7 @@ def test_the_pairs_are_those_of_looking_at_all(seed: int) -> None:
         where.update(b, points[b])
         entered = [where.cell_of(s) for s in range(len(where.body))]
         for s, cell in enumerate(entered):
-            assert cell < 0 or s in where.in_cell(cell)
+            assert cell < 0 or s in in_cell(where, cell)
         index = np.concatenate(bodies)
         truth = [
             (s, t)
@@ -100,6 +100,34 @@ def test_a_push_moves_the_contact_point_by_the_overlap_with_the_least_motion() -
     share = overlap / (1.0 + lever @ lever / rho**2)
     centre_moved = after.apply(pose.inverse().apply(centre)) - centre
     np.testing.assert_allclose(centre_moved, share * met.normal, atol=1e-12)
+
+
+def separate(
+    where: OccupancyMap, still: int, moving: int, points: Array, normals: Array, pose: Rigid, most: int = 64
+) -> tuple[Rigid, int]:
+    """Push the rigid body ``moving`` away from ``still`` until they share no cell; returns its pose and the rounds.
+
+    ``points`` and ``normals`` (s, 3) are of all entries of the map: in the world, but for the moving body's own, which
+    are in its frame. Ends after ``most`` rounds, whatever is left.
+    """
+    own = slice(int(where.begin[moving]), int(where.begin[moving + 1]))
+    body_points, body_normals = points[own], normals[own]
+    middle = body_points.mean(axis=0)
+    gyration = math.sqrt(float(np.mean(np.sum((body_points - middle) ** 2, axis=1))))
+    at, facing = points.copy(), normals.copy()
+    for done in range(most):
+        at[own] = pose.apply(body_points)
+        facing[own] = Rigid(np.zeros(3), pose.quaternion).apply(body_normals)
+        where.update(moving, np.ascontiguousarray(at[own]))
+        pairs = where.touching()
+        bodies = where.body[pairs]
+        ahead = (bodies[:, 0] == still) & (bodies[:, 1] == moving)
+        back = (bodies[:, 0] == moving) & (bodies[:, 1] == still)
+        met = region(at, facing, np.concatenate([pairs[ahead], pairs[back][:, ::-1]]), where.cell_mm)
+        if met is None:
+            return pose, done
+        pose = push(met, pose, pose.apply(middle), gyration)
+    return pose, most
 
 
 def test_two_bones_do_not_stay_in_each_other() -> None:

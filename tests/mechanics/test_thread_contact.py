@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from round_jaws import touch_capsules
 
 from trainer.geometry import Array
-from trainer.mechanics.thread_contact import ContactsFull, clear, touch_capsules, touch_itself, touch_triangles
+from trainer.mechanics.thread_contact import ContactsFull, clear, touch_itself, touch_triangles
 from trainer.mechanics.thread_rod import RodModel, RodState, begin, holds, no_contacts, step
 
 RADIUS = 0.011

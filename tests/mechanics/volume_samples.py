@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import strategies as st
 
+from trainer.mechanics.occupancy import OccupancyMap
 from trainer.mechanics.volume import FREE, LINKS, PRESENT, Material, Volume, VolumeState, build
 
 SPACING = (0.5, 0.6, 0.8)
@@ -33,6 +34,15 @@ def random_shape(seed: int, shape: tuple[int, int, int], void: float, rigid: flo
     labels[(dice >= void) & (dice < void + rigid)] = 9
     labels.reshape(-1)[:soft] = np.arange(1, soft + 1)
     return labels
+
+
+def in_cell(where: OccupancyMap, cell: int) -> list[int]:
+    """The entries of a cell of the map."""
+    entries, s = [], int(where._head[cell])
+    while s >= 0:
+        entries.append(s)
+        s = int(where._after[s])
+    return entries
 
 
 def cut_some(volume: Volume, state: VolumeState, seed: int, share: float) -> None:

@@ -20,7 +20,6 @@ class Structure:
 
     number: int = field(metadata={"bounds": Bounds(1, 255)})
     kind: Literal["bone", "cartilage", "meniscus", "ligament"]
-    rigid: bool
     opacity_per_mm: float = field(metadata={"bounds": Bounds(0.0, 100.0)})
     colour: tuple[int, int, int] = field(metadata={"bounds": Bounds(0, 255)})
 
@@ -41,11 +40,6 @@ def structures() -> dict[str, Structure]:
 def shown() -> dict[int, tuple[tuple[int, int, int], float]]:
     """Colour and opacity per mm of each structure by its number, as pictures take them."""
     return {s.number: (s.colour, s.opacity_per_mm) for s in structures().values()}
-
-
-def rigid_numbers() -> list[int]:
-    """The numbers of what does not deform."""
-    return [s.number for s in structures().values() if s.rigid]
 
 
 def number_of(name: str) -> int:

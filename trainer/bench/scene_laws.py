@@ -27,8 +27,6 @@ from trainer.scene import Scene
 LENGTH_ERROR = 1e-6
 #: What may be left unbalanced in tissue at rest, mN: ten times the bound at which the scene stops its iterations.
 SETTLED_mN = 0.1
-#: Rounding of places, mm.
-ROUNDING_MM = 1e-6
 
 
 def step(s: Scene, poses: ToolPoses) -> tuple[Event, ...]:

@@ -10,13 +10,11 @@ surface elements: away from the links that an element has.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from trainer.geometry import Array, Rigid, cross, quaternion_from_axis_angle
-from trainer.mechanics.occupancy import OccupancyMap
 from trainer.mechanics.volume import STEPS, Indices, VolumeState
 
 
@@ -76,34 +74,6 @@ def push(contact: Region, pose: Rigid, centre: Array, gyration_mm: float) -> Rig
     spin = Rigid(np.zeros(3), quaternion_from_axis_angle(turn, angle)) if angle > 1e-12 else Rigid.identity()
     moved = spin.apply(pose.position - centre) + centre + share * contact.normal
     return Rigid(moved, (spin @ pose).quaternion)
-
-
-def separate(
-    where: OccupancyMap, still: int, moving: int, points: Array, normals: Array, pose: Rigid, most: int = 64
-) -> tuple[Rigid, int]:
-    """Push the rigid body ``moving`` away from ``still`` until they share no cell; returns its pose and the rounds.
-
-    ``points`` and ``normals`` (s, 3) are of all entries of the map: in the world, but for the moving body's own, which
-    are in its frame. Ends after ``most`` rounds, whatever is left.
-    """
-    own = slice(int(where.begin[moving]), int(where.begin[moving + 1]))
-    body_points, body_normals = points[own], normals[own]
-    middle = body_points.mean(axis=0)
-    gyration = math.sqrt(float(np.mean(np.sum((body_points - middle) ** 2, axis=1))))
-    at, facing = points.copy(), normals.copy()
-    for done in range(most):
-        at[own] = pose.apply(body_points)
-        facing[own] = Rigid(np.zeros(3), pose.quaternion).apply(body_normals)
-        where.update(moving, np.ascontiguousarray(at[own]))
-        pairs = where.touching()
-        bodies = where.body[pairs]
-        ahead = (bodies[:, 0] == still) & (bodies[:, 1] == moving)
-        back = (bodies[:, 0] == moving) & (bodies[:, 1] == still)
-        met = region(at, facing, np.concatenate([pairs[ahead], pairs[back][:, ::-1]]), where.cell_mm)
-        if met is None:
-            return pose, done
-        pose = push(met, pose, pose.apply(middle), gyration)
-    return pose, most
 
 
 def push_out(

@@ -148,11 +148,3 @@ class OccupancyMap:
     def cell_of(self, entry: int) -> int:
         """The cell that an entry is in; -1 is outside the map."""
         return int(self._cell[entry])
-
-    def in_cell(self, cell: int) -> list[int]:
-        """The entries of a cell."""
-        entries, s = [], int(self._head[cell])
-        while s >= 0:
-            entries.append(s)
-            s = int(self._after[s])
-        return entries
