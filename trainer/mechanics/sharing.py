@@ -33,15 +33,16 @@ def _threads() -> int:
 
 @cache
 def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(MOST_THREADS - 1, thread_name_prefix="volume")
+    """All threads but the caller's."""
+    return ThreadPoolExecutor(max(1, _threads() - 1), thread_name_prefix="volume")
 
 
 def start() -> None:
     """Count the cores and start the threads, before the caller takes a core to itself: afterwards it would see and
     give to new threads no other."""
-    _threads()
-    all_there = Barrier(MOST_THREADS)
-    waiting = [_pool().submit(all_there.wait) for _ in range(MOST_THREADS - 1)]
+    others = max(1, _threads() - 1)
+    all_there = Barrier(others + 1)
+    waiting = [_pool().submit(all_there.wait) for _ in range(others)]
     all_there.wait()
     for one in waiting:
         one.result()
@@ -56,6 +57,9 @@ def parts(begin: int, end: int, elements: int) -> list[tuple[int, int]]:
 
 
 def share_out(work: Callable[[tuple[int, int]], T], pieces: list[tuple[int, int]]) -> list[T]:
-    """``work`` for each piece, at the same time, the first one by the caller; results in the pieces' order."""
-    others = [_pool().submit(work, piece) for piece in pieces[1:]]
-    return [work(pieces[0]), *(other.result() for other in others)]
+    """``work`` for each piece, at the same time; results in the pieces' order. The caller does what none has begun."""
+    if len(pieces) == 1:
+        return [work(pieces[0])]
+    given = [_pool().submit(work, piece) for piece in pieces]
+    own = {i: work(pieces[i]) for i in reversed(range(len(pieces))) if given[i].cancel()}
+    return [own[i] if i in own else given[i].result() for i in range(len(pieces))]
