@@ -218,14 +218,14 @@ def _stitched(task_file: TaskFile, folder: Path) -> str:
     """The scripted expert performs the task once, without pauses; what ``devices simulate --motion`` takes."""
     from contextlib import ExitStack
 
-    from trainer.cli.practice import perform
+    from trainer.cli.practice import Asked, perform
     from trainer.clock import Fast
     from trainer.log.schema import new_session_id
 
     log_path, session_id = folder / "motion.db", new_session_id()
     with ExitStack() as stack:
-        clock = Fast(task_file.task.tick_hz)
-        perform(stack, task_file, session_id, "bench", "scripted-expert", 0, clock, log_path, None)
+        asked = Asked(task_file, session_id, "bench", "scripted-expert", 0, log_path)
+        perform(stack, asked, Fast(task_file.task.tick_hz))
     return f"{log_path}#{session_id}"
 
 
@@ -234,7 +234,7 @@ def _practised(task_file: TaskFile, folder: Path, minutes: float) -> Practised:
     from contextlib import ExitStack
 
     from trainer.bench.soak import with_rest
-    from trainer.cli.practice import perform
+    from trainer.cli.practice import Asked, perform
     from trainer.curriculum import parse_task
     from trainer.log.schema import new_session_id
 
@@ -246,11 +246,10 @@ def _practised(task_file: TaskFile, folder: Path, minutes: float) -> Practised:
     ) -> dict[str, Any]:
         session_id = new_session_id()
         recording = folder / f"{session_id}.rrd"
+        task = resting if long else task_file
+        asked = Asked(task, session_id, "bench", str(profile), 0, folder / "log.db", recording)
         with ExitStack() as stack:
-            done = perform(
-                stack, resting if long else task_file, session_id, "bench", str(profile), 0, clock,
-                folder / "log.db", recording, enough, observed,
-            )  # fmt: skip
+            done = perform(stack, asked, clock, enough, observed)
         recording.unlink()
         return done
 
@@ -261,16 +260,15 @@ def _session(task_file: TaskFile, folder: Path) -> Perform:
     """Performs one session of a task by the scripted expert, log and recording in ``folder``."""
     from contextlib import ExitStack
 
-    from trainer.cli.practice import perform
+    from trainer.cli.practice import Asked, perform
     from trainer.log.schema import new_session_id
 
     def session(seed: int, clock: Realtime, enough: Callable[[], bool]) -> str:
         session_id = new_session_id()
         log_path, recording = folder / "log.db", folder / f"{session_id}.rrd"
+        asked = Asked(task_file, session_id, "bench", "scripted-expert", seed, log_path, recording)
         with ExitStack() as stack:
-            done = perform(
-                stack, task_file, session_id, "bench", "scripted-expert", seed, clock, log_path, recording, enough
-            )
+            done = perform(stack, asked, clock, enough)
         return str(done["outcome"])
 
     return session

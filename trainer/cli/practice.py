@@ -7,18 +7,23 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing, nullcontext
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 if TYPE_CHECKING:
+    from trainer.anatomy.imported import Anatomy
+    from trainer.choice import Choice
     from trainer.clock import Fast
     from trainer.curriculum import TaskFile
     from trainer.drivers.driver import Driver
     from trainer.log.record import SessionHeader
     from trainer.profile import ProfileFile
+    from trainer.scene import Scene
+    from trainer.sinks.log import LogSink
+    from trainer.sinks.recording import RecordingSink
     from trainer.sinks.surface import Sink
 
 
@@ -66,8 +71,9 @@ def practice(
     recording = None if no_record else (record or log_path.parent / "recordings" / f"{session_id}.rrd").absolute()
     task_file = load_task(task)
     clock = (Realtime if realtime else Fast)(task_file.task.tick_hz)
+    asked = Asked(task_file, session_id, name, device, seed, log_path, recording, anatomy)
     with ExitStack() as stack:
-        result = perform(stack, task_file, session_id, name, device, seed, clock, log_path, recording, anatomy=anatomy)
+        result = perform(stack, asked, clock)
         if as_json:
             print(json.dumps(result, indent=2, allow_nan=False))
         else:
@@ -80,96 +86,145 @@ def practice(
     # A recording that could not be finished says so here, when everything else is stored and printed.
 
 
+@dataclass(frozen=True)
+class Asked:
+    """What a session is asked to be."""
+
+    task_file: TaskFile
+    session_id: str
+    trainee: str
+    device: str  # a profile's name or file, or a recording
+    seed: int
+    log_path: Path
+    recording_path: Path | None = None
+    anatomy: str = ""  # the knee to practise in, where that is not the task's own
+
+
+@dataclass(frozen=True)
+class _Session:
+    """What a session runs on, from its opening to its end."""
+
+    asked: Asked
+    tissue: Choice | None
+    knee: Anatomy | None
+    scene: Scene
+    profile: ProfileFile
+    driver: Driver
+    clock: Fast
+    log: LogSink
+    recording: RecordingSink | None
+    sinks: tuple[Sink, ...]  # the log first
+    devices: ExitStack  # closes what was opened for the hand
+
+
 def perform(
     stack: ExitStack,
-    task_file: TaskFile,
-    session_id: str,
-    trainee: str,
-    device: str,
-    seed: int,
+    asked: Asked,
     clock: Fast,
-    log_path: Path,
-    recording_path: Path | None,
     enough: Callable[[], bool] = lambda: False,
     observed: Callable[[Driver, Sequence[Sink]], Sink] | None = None,
-    anatomy: str = "",
 ) -> dict[str, Any]:
     """Run one exercise and store it; the document that ``--json`` prints. ``stack`` closes what was opened.
 
     ``clock`` is a fresh one at the task's rate. ``enough``, asked once in each tick, ends the session like Ctrl-C.
-    ``observed`` is given the device and the sinks and makes one more sink, which may look at them. ``anatomy`` is the
-    knee to practise in, where that is not the task's own.
+    ``observed`` is given the device and the sinks and makes one more sink, which may look at them.
     Whatever can be refused is refused before the session enters the log. Raises ConfigError for a task or
     device that cannot be used, LogError and RecordingError where they cannot be written.
     """
+    session = _open(stack, asked, clock)
+    _run(session, enough, observed)
+    return _finish(session)
+
+
+def _open(stack: ExitStack, asked: Asked, clock: Fast) -> _Session:
+    """Everything that a session needs, in the order in which it can be refused: the log comes last."""
     from trainer.anatomy import library
-    from trainer.choice import choose_tissue, region_method, thread_method
-    from trainer.cli.progress import Progress
+    from trainer.choice import choose_tissue
     from trainer.cli.warmup import announce, warm_up
     from trainer.clock import Realtime
     from trainer.drivers import open_driver
     from trainer.drivers.driver import LiveDriver
     from trainer.drivers.makers import stdout_kept
-    from trainer.log.record import ANATOMY, ANATOMY_SHA256, TOLERANCE
-    from trainer.metrics.registry import check_targets, score
-    from trainer.own_core import own_core
-    from trainer.reporting.wording import out_of_sight
+    from trainer.metrics.registry import check_targets
     from trainer.scene import build
-    from trainer.session import interruptible, old_objects_left_alone, run
     from trainer.sinks.igtlink import IgtlinkSink
     from trainer.sinks.log import LogSink
     from trainer.sinks.recording import RecordingSink
 
-    task = task_file.task
+    task = asked.task_file.task
     check_targets(task)
-    tissue = choose_tissue(task, task_file.path)
-    knee = library.of_task(task.scene.anatomy, anatomy)
-    if recording_path is not None:
-        _make_room(recording_path)
-    _close_interrupted(log_path)
+    tissue = choose_tissue(task, asked.task_file.path)
+    knee = library.of_task(task.scene.anatomy, asked.anatomy)
+    if asked.recording_path is not None:
+        _make_room(asked.recording_path)
+    _close_interrupted(asked.log_path)
     announce()
     scene = build(task, **({} if tissue is None else {"tolerance_mN": tissue.tolerance_mN}), anatomy=knee)
-    session = stack.enter_context(ExitStack())
-    session.enter_context(stdout_kept())  # a device's library may print whenever it opens it again
-    profile, driver = open_driver(device, task, scene.home, seed)
-    session.enter_context(closing(driver))
+    devices = stack.enter_context(ExitStack())
+    devices.enter_context(stdout_kept())  # a device's library may print whenever it opens it again
+    profile, driver = open_driver(asked.device, task, scene.home, asked.seed)
+    devices.enter_context(closing(driver))
     if isinstance(driver, LiveDriver) and not clock.realtime:
         clock = Realtime(task.tick_hz)  # a hand has its own pace; waiting for it is no work of a tick
     if clock.realtime:
         warm_up(task, knee)
-    header = _header(session_id, trainee, task_file, profile, seed, scene.tools, recording_path)
-    if tissue is not None:  # a float's text holds all its bits
-        header.versions[TOLERANCE] = repr(tissue.tolerance_mN)
-    if knee is not None:
-        header.versions.update({ANATOMY: knee.reference, ANATOMY_SHA256: library.fingerprint(knee)})
+    header = _header(asked, profile, scene.tools, tissue, knee)
     sinks: list[Sink] = []
     recording = None
-    if recording_path is not None:
-        recording = RecordingSink(recording_path, header, scene.layout(), task.tick_hz, realtime=clock.realtime)
+    if asked.recording_path is not None:
+        recording = RecordingSink(asked.recording_path, header, scene.layout(), task.tick_hz, realtime=clock.realtime)
         sinks.append(stack.enter_context(closing(recording)))
-    if profile.profile.publish is not None:
-        published = profile.profile.publish
+    published = profile.profile.publish
+    if published is not None:
         sinks.append(stack.enter_context(closing(IgtlinkSink(published.host, published.port, scene.tools))))
-    log = stack.enter_context(closing(LogSink(log_path, header)))
+    log = stack.enter_context(closing(LogSink(asked.log_path, header)))
+    return _Session(asked, tissue, knee, scene, profile, driver, clock, log, recording, (log, *sinks), devices)
+
+
+def _run(
+    session: _Session, enough: Callable[[], bool], observed: Callable[[Driver, Sequence[Sink]], Sink] | None
+) -> None:
+    """The exercise itself."""
+    from trainer.cli.progress import Progress
+    from trainer.drivers.driver import LiveDriver
+    from trainer.own_core import own_core
+    from trainer.session import interruptible, old_objects_left_alone, run
+
+    driver, clock, sinks = session.driver, session.clock, session.sinks
     undisturbed = own_core() if clock.realtime else nullcontext()
-    with closing(Progress(task)) as progress, interruptible() as interrupted, old_objects_left_alone(), undisturbed:
+    with (
+        closing(Progress(session.asked.task_file.task)) as progress,
+        interruptible() as interrupted,
+        old_objects_left_alone(),
+        undisturbed,
+    ):
         told: list[Sink] = [driver] if isinstance(driver, LiveDriver) else []
         if observed is not None:
-            told.append(observed(driver, [log, *sinks]))
-        run(scene, driver, [log, *sinks, progress, *told], clock, lambda: interrupted() or enough())
+            told.append(observed(driver, sinks))
+        run(session.scene, driver, [*sinks, progress, *told], clock, lambda: interrupted() or enough())
+
+
+def _finish(session: _Session) -> dict[str, Any]:
+    """Score and seal the session; the document about it."""
+    from trainer.choice import region_method, thread_method
+    from trainer.metrics.registry import score
+    from trainer.reporting.wording import out_of_sight
+
+    asked, scene, log, recording = session.asked, session.scene, session.log, session.recording
+    task = asked.task_file.task
     duration_s = scene.tick / task.tick_hz
     stored = log.record(scene.outcome, scene.tick, duration_s)
     metrics = score(stored, task)
     if recording is not None:
         recording.metrics(metrics)
-    pace, seen = clock.report(), driver.summary()
+    pace, seen = session.clock.report(), session.driver.summary()
     log.finish(scene.outcome, scene.reason, scene.tick, duration_s, pace, seen, metrics)
-    session.close()
+    session.devices.close()
     return {
-        "session": session_id,
-        "task": task_file.path,
-        "anatomy": None if knee is None else knee.reference,
-        "trainee": trainee,
+        "session": asked.session_id,
+        "task": asked.task_file.path,
+        "anatomy": None if session.knee is None else session.knee.reference,
+        "trainee": asked.trainee,
         "outcome": scene.outcome,
         "reason": scene.reason,
         "duration_s": duration_s,
@@ -177,47 +232,48 @@ def perform(
         "events": dict(Counter(event.kind for event in stored.events)),
         "metrics": [asdict(metric) for metric in metrics],
         "out_of_sight": out_of_sight(stored.events),
-        "recording": None if recording_path is None else str(recording_path),
+        "recording": None if asked.recording_path is None else str(asked.recording_path),
         "dropped_frames": 0 if recording is None else recording.dropped_frames,
-        "log": str(log_path),
+        "log": str(asked.log_path),
         "methods": {
-            "tissue": None if tissue is None else asdict(tissue),
+            "tissue": None if session.tissue is None else asdict(session.tissue),
             "thread": thread_method(task.scene.thread),
             "region": region_method(task.scene.anatomy),
         },
         "realtime": pace,
-        "device": {"name": device, "seed": seed, **seen},
+        "device": {"name": asked.device, "seed": asked.seed, **seen},
     }
 
 
 def _header(
-    session_id: str,
-    trainee: str,
-    task_file: TaskFile,
-    profile: ProfileFile,
-    seed: int,
-    tools: tuple[str, ...],
-    recording: Path | None,
+    asked: Asked, profile: ProfileFile, tools: tuple[str, ...], tissue: Choice | None, knee: Anatomy | None
 ) -> SessionHeader:
     from datetime import UTC, datetime
 
-    from trainer.log.record import SessionHeader
+    from trainer.anatomy import library
+    from trainer.log.record import ANATOMY, ANATOMY_SHA256, TOLERANCE, SessionHeader
 
+    chosen = {}
+    if tissue is not None:  # a float's text holds all its bits
+        chosen[TOLERANCE] = repr(tissue.tolerance_mN)
+    if knee is not None:
+        chosen.update({ANATOMY: knee.reference, ANATOMY_SHA256: library.fingerprint(knee)})
+    task_file = asked.task_file
     return SessionHeader(
-        id=session_id,
-        trainee=trainee,
+        id=asked.session_id,
+        trainee=asked.trainee,
         task=task_file.path,
         task_toml=task_file.text,
         task_sha256=task_file.sha256,
         device=profile.path,
         device_toml=profile.text,
         device_sha256=profile.sha256,
-        seed=seed,
+        seed=asked.seed,
         tick_hz=task_file.task.tick_hz,
         tools=tools,
         started_at=datetime.now(UTC).isoformat(timespec="milliseconds"),
-        versions=versions(),
-        recording=None if recording is None else str(recording),
+        versions=versions() | chosen,
+        recording=None if asked.recording_path is None else str(asked.recording_path),
     )
 
 
