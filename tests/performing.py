@@ -7,13 +7,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from trainer import scene
+from trainer.anatomy.imported import Anatomy
 from trainer.curriculum import Task, load_task
-from trainer.drivers.scripted import ScriptedHands
+from trainer.drivers import scripted_hands
 from trainer.events import Event, Pierce, TaskDone
 from trainer.interactions.holding import TOLERANCE_MN
+from trainer.interactions.region import Region
 from trainer.log.record import SessionHeader, SessionRecord
+from trainer.mechanics.volume import PRESENT
 from trainer.poses import ToolPoses
-from trainer.profile import Hand
+from trainer.profile import Hand, load_profile
 
 
 @dataclass(frozen=True)
@@ -32,10 +35,28 @@ class Performance:
         return [e for e in self.events if isinstance(e, Pierce) and (e.body, e.wall) == (vessel, wall)]
 
 
-def perform(task: Task, hand: Hand, seed: int = 0, tolerance_mN: float = TOLERANCE_MN) -> Performance:
-    """Let a scripted hand go through a task; every state on the way must be finite."""
-    s = scene.build(task, tolerance_mN)
-    hands = ScriptedHands(hand, task, s.home, seed)
+def region_of(s: scene.Scene) -> Region:
+    assert s.world.region is not None
+    return s.world.region
+
+
+def perform(
+    task: Task,
+    hand: Hand | str,
+    seed: int = 0,
+    tolerance_mN: float = TOLERANCE_MN,
+    anatomy: Anatomy | None = None,
+) -> Performance:
+    """Let a scripted hand, or that of a device's profile, go through a task; every state on the way must be finite, and
+    no element may be lost."""
+    if isinstance(hand, str):
+        profiled = load_profile(hand).profile.hand
+        assert profiled is not None
+        hand = profiled
+    s = scene.build(task, tolerance_mN, anatomy)
+    hands = scripted_hands(hand, task, s.home, seed)
+    region = s.world.region
+    elements = 0 if region is None else np.count_nonzero(region.state.links & PRESENT)
     events: list[Event] = []
     poses: list[ToolPoses] = []
     while not s.outcome:
@@ -47,6 +68,9 @@ def perform(task: Task, hand: Hand, seed: int = 0, tolerance_mN: float = TOLERAN
             events += s.step(seen)
         assert np.isfinite(s.world.nodes).all()
         assert s.world.solver is None or np.isfinite(s.world.solver.x).all()
+        if region is not None:
+            assert np.isfinite(region.state.u).all()
+            assert np.count_nonzero(region.state.links & PRESENT) == elements
     return Performance(s, tuple(events), tuple(poses))
 
 

@@ -2,70 +2,36 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from performing import Performance, perform, region_of
 
 from trainer import curriculum, scene
 from trainer.config import ConfigError
-from trainer.curriculum import TISSUE_STEPS, Task, load_task
+from trainer.curriculum import TISSUE_STEPS, load_task
 from trainer.drivers import scripted_hands
 from trainer.events import Cut, Event, Grasp, Probe, StepDone, Tack
-from trainer.interactions.region import Region
-from trainer.mechanics.volume import PRESENT
 from trainer.poses import ToolPoses
-from trainer.profile import Hand, load_profile
+from trainer.profile import Hand
 
 LIGAMENT = load_task("arthroscopy/ligament-2d").task
 PCL = "posterior cruciate ligament"
 LEFT, RIGHT = 0, 1
 
 
-@dataclass(frozen=True)
-class Done:
-    scene: scene.Scene
-    events: list[Event]
-    poses: list[ToolPoses]
-
-
-def region_of(s: scene.Scene) -> Region:
-    assert s.world.region is not None
-    return s.world.region
-
-
-def perform(task: Task, device: str, seed: int = 0) -> Done:
-    """A scripted hand goes through a task; at every tick all places are finite and no element is lost."""
-    hand = load_profile(device).profile.hand
-    assert hand is not None
-    s = scene.build(task)
-    region = region_of(s)
-    count = np.count_nonzero(region.state.links & PRESENT)
-    hands = scripted_hands(hand, task, s.home, seed)
-    events: list[Event] = []
-    poses: list[ToolPoses] = []
-    while not s.outcome:
-        seen = hands.poll(s.tick, s.view())
-        if seen is None:
-            events += s.finish("failed", str(hands.summary()["stopped"]))
-        else:
-            poses.append(seen)
-            events += s.step(seen)
-        assert np.isfinite(region.state.u).all()
-        assert np.count_nonzero(region.state.links & PRESENT) == count
-    return Done(s, events, poses)
-
-
 @pytest.fixture(scope="module")
-def expert() -> Done:
+def expert() -> Performance:
     return perform(LIGAMENT, "scripted-expert")
 
 
-def kinds(events: list[Event]) -> list[str]:
+def kinds(events: Iterable[Event]) -> list[str]:
     return [e.kind for e in events]
 
 
-def test_the_expert_completes_every_step_in_order(expert: Done) -> None:
+def test_the_expert_completes_every_step_in_order(expert: Performance) -> None:
     assert expert.scene.outcome == "completed"
     assert [e.index for e in expert.events if isinstance(e, StepDone)] == list(range(len(LIGAMENT.step)))
     assert {s.kind for s in LIGAMENT.step} == set(TISSUE_STEPS)
@@ -74,7 +40,7 @@ def test_the_expert_completes_every_step_in_order(expert: Done) -> None:
     assert not {"tear", "slip", "overforce", "probe"} & set(found)
 
 
-def test_volumes_are_whole_elements_and_the_cut_lies_on_the_femurs_side(expert: Done) -> None:
+def test_volumes_are_whole_elements_and_the_cut_lies_on_the_femurs_side(expert: Performance) -> None:
     """An element is 1 by 1 by 6 mm; between tack and femur is above the grasped place."""
     sizes = [
         e.volume_mm3 / region_of(expert.scene).volume.element_mm3 for e in expert.events if isinstance(e, Cut | Tack)
@@ -84,7 +50,7 @@ def test_volumes_are_whole_elements_and_the_cut_lies_on_the_femurs_side(expert: 
     assert all(e.point[1] > grasped.point[1] for e in expert.events if isinstance(e, Cut))
 
 
-def test_cut_tissue_springs_back(expert: Done) -> None:
+def test_cut_tissue_springs_back(expert: Performance) -> None:
     """What was pulled by 3 mm and is cut off from the tack is within half of that from where it rests."""
     region = region_of(expert.scene)
     elements = region.elements[PCL]
@@ -94,20 +60,20 @@ def test_cut_tissue_springs_back(expert: Done) -> None:
     assert region.parted_mm(PCL) >= LIGAMENT.step[-1].at_least_mm
 
 
-def test_a_novice_is_worse(expert: Done) -> None:
+def test_a_novice_is_worse(expert: Performance) -> None:
     """Longer, and with faults that the expert does not make."""
     novice = perform(LIGAMENT, "scripted-novice", seed=1)
     assert novice.scene.tick > 2 * expert.scene.tick
     assert {"tear", "slip", "overforce", "probe"} & set(kinds(novice.events))
 
 
-def test_the_same_poses_give_the_same_events(expert: Done) -> None:
+def test_the_same_poses_give_the_same_events(expert: Performance) -> None:
     again = scene.build(LIGAMENT)
-    assert [e for p in expert.poses for e in again.step(p)] == expert.events
+    assert tuple(e for p in expert.poses for e in again.step(p)) == expert.events
     assert np.array_equal(region_of(again).state.u, region_of(expert.scene).state.u)
 
 
-def test_where_the_scene_stands_changes_nothing_that_happens(expert: Done) -> None:
+def test_where_the_scene_stands_changes_nothing_that_happens(expert: Performance) -> None:
     """Poses that are turned with the scene give the same kinds at the same ticks: it is simulated in its own frame."""
     spec = replace(LIGAMENT.scene, position_mm=(100.0, -50.0, 30.0), rotation_deg=(20.0, -40.0, 70.0))
     moved = perform(replace(LIGAMENT, scene=spec, step=LIGAMENT.step[:1]), "scripted-expert")

@@ -18,7 +18,6 @@ from trainer import scene
 from trainer.curriculum import load_task
 from trainer.metrics import score
 from trainer.poses import ToolPoses
-from trainer.profile import load_profile
 
 SEEDS = int(os.environ.get("TRAINER_SEEDS", "8"))
 TASK = "anastomosis/single-stitch"
@@ -27,9 +26,7 @@ TASK = "anastomosis/single-stitch"
 def one(hand: str, seed: int) -> dict[str, float | str | None]:
     """One session: its metrics, and how true its last event is; every fourth time to a scene simulated anew."""
     task = load_task(TASK).task
-    profile = load_profile(hand).profile
-    assert profile.hand is not None
-    done = perform(task, profile.hand, seed)
+    done = perform(task, hand, seed)
     world, end = done.scene.world, done.done
     if seed % 4 == 0:
         again = scene.build(task)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.lib.stride_tricks import sliding_window_view
-from performing import Performance, record_of
+from performing import Performance, perform, record_of, region_of
 
 from trainer import curriculum, scene
 from trainer.anatomy import knee, label_map, library, volume_file
@@ -17,15 +17,12 @@ from trainer.anatomy.label_volume import sorted_axes
 from trainer.anatomy.ligaments import swept_cruciates
 from trainer.config import ConfigError
 from trainer.curriculum import Task, load_task
-from trainer.drivers import scripted_hands
 from trainer.events import Cut, Event, Overforce, PortalEnter, PortalExit, Probe, StepDone
 from trainer.geometry import Array
-from trainer.interactions.region import Region
 from trainer.mechanics.density_field import REACH, WEIGHTS
 from trainer.mechanics.volume import FREE, PRESENT
 from trainer.metrics import score
 from trainer.poses import ToolPoses
-from trainer.profile import load_profile
 
 REAL = Path(__file__).parents[2] / "shared/data/knee/SAG_3D_DESS_RIGHT_bones_cart_men_fib-label.nrrd"
 real_knee = pytest.mark.skipif(not REAL.exists(), reason="the segmented knee of shared/data is not here")
@@ -46,31 +43,6 @@ def real() -> Anatomy:
     volume, swept, _ = swept_cruciates(sorted_axes(volume_file.read(REAL), given.renumber()), "right")
     assert set(swept) == {PCL, ACL}
     return Anatomy("real", volume, "right", "real")
-
-
-def region_of(s: scene.Scene) -> Region:
-    assert s.world.region is not None
-    return s.world.region
-
-
-def perform(task: Task, anatomy: Anatomy, device: str, seed: int = 0) -> Performance:
-    """A scripted hand goes through a task; at every tick all places are finite."""
-    hand = load_profile(device).profile.hand
-    assert hand is not None
-    s = scene.build(task, anatomy=anatomy)
-    region = region_of(s)
-    hands = scripted_hands(hand, task, s.home, seed)
-    events: list[Event] = []
-    poses: list[ToolPoses] = []
-    while not s.outcome:
-        seen = hands.poll(s.tick, s.view())
-        if seen is None:
-            events += s.finish("failed", str(hands.summary()["stopped"]))
-        else:
-            poses.append(seen)
-            events += s.step(seen)
-        assert np.isfinite(region.state.u).all()
-    return Performance(s, tuple(events), tuple(poses))
 
 
 def metrics(done: Performance, task: Task) -> dict[str, float | None]:
@@ -94,7 +66,7 @@ def check_release(done: Performance) -> None:
 
 @pytest.fixture(scope="module")
 def released(built: Anatomy) -> Performance:
-    return perform(RELEASE, built, "scripted-expert")
+    return perform(RELEASE, "scripted-expert", anatomy=built)
 
 
 def test_the_expert_releases_the_ligament_of_the_built_in_knee(released: Performance) -> None:
@@ -104,12 +76,12 @@ def test_the_expert_releases_the_ligament_of_the_built_in_knee(released: Perform
 
 @real_knee
 def test_the_expert_releases_the_ligament_of_the_real_knee(real: Anatomy) -> None:
-    check_release(perform(RELEASE, real, "scripted-expert"))
+    check_release(perform(RELEASE, "scripted-expert", anatomy=real))
 
 
 @pytest.fixture(scope="module")
 def probed(built: Anatomy) -> Performance:
-    return perform(LANDMARKS, built, "scripted-expert")
+    return perform(LANDMARKS, "scripted-expert", anatomy=built)
 
 
 def check_landmarks(done: Performance) -> None:
@@ -127,13 +99,13 @@ def test_the_expert_touches_the_landmarks_of_the_built_in_knee(probed: Performan
 
 @real_knee
 def test_the_expert_touches_the_landmarks_of_the_real_knee(real: Anatomy) -> None:
-    check_landmarks(perform(LANDMARKS, real, "scripted-expert"))
+    check_landmarks(perform(LANDMARKS, "scripted-expert", anatomy=real))
 
 
 def test_a_novice_is_worse_at_the_landmarks(built: Anatomy, probed: Performance) -> None:
     """Longer, further, harder: of a hand that hesitates, makes detours and stops late."""
     expert = metrics(probed, LANDMARKS)
-    novice = metrics(perform(LANDMARKS, built, "scripted-novice"), LANDMARKS)
+    novice = metrics(perform(LANDMARKS, "scripted-novice", anatomy=built), LANDMARKS)
     for name in ("time_s", "path_length_right_mm", "probe_force_max_mN"):
         a, b = expert[name], novice[name]
         assert a is not None
@@ -152,7 +124,7 @@ def test_a_left_knee_can_be_probed_too(tmp_path: Path) -> None:
     text = (Path(knee.__file__).parent / "data/knees/knee.toml").read_text()
     path.write_text(text.replace('side = "right"', 'side = "left"'))
     left = Anatomy("left", knee.build(knee.load(str(path)), 1.0), "left", "left")
-    done = perform(replace(LANDMARKS, step=LANDMARKS.step[:2]), left, "scripted-expert")
+    done = perform(replace(LANDMARKS, step=LANDMARKS.step[:2]), "scripted-expert", anatomy=left)
     assert done.done.outcome == "completed"
 
 
