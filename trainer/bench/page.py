@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib import import_module
 from pathlib import Path
@@ -36,9 +36,13 @@ SUBJECTS = {
 Rows = Mapping[str, Sequence[Row]]
 
 
-def measure(quick: bool) -> dict[str, list[Row]]:
-    """All subjects, one after the other."""
-    return {name: import_module(f"trainer.bench.{name}").measure(quick) for name in SUBJECTS}
+def measure(quick: bool, tell: Callable[[str], None]) -> dict[str, list[Row]]:
+    """All subjects, one after the other; ``tell`` is told which one it is at."""
+    found = {}
+    for name in SUBJECTS:
+        tell(f"{SUBJECTS[name].title}, {len(found) + 1} of {len(SUBJECTS)}")
+        found[name] = import_module(f"trainer.bench.{name}").measure(quick)
+    return found
 
 
 def document(rows: Rows, about: dict[str, Any], quick: bool) -> dict[str, Any]:

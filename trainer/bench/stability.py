@@ -61,9 +61,13 @@ class Outcome:
 Outcomes = Mapping[str, Sequence[Outcome]]
 
 
-def measure(quick: bool) -> dict[str, list[Outcome]]:
-    """All cases of all subjects, one after the other."""
-    return {name: collect(import_module(f"trainer.bench.{name}").cases(), quick) for name in SUBJECTS}
+def measure(quick: bool, tell: Callable[[str], None]) -> dict[str, list[Outcome]]:
+    """All cases of all subjects, one after the other; ``tell`` is told which one it is at."""
+    found = {}
+    for name in SUBJECTS:
+        tell(f"{SUBJECTS[name]}, {len(found) + 1} of {len(SUBJECTS)}")
+        found[name] = collect(import_module(f"trainer.bench.{name}").cases(), quick)
+    return found
 
 
 def collect(cases: Iterable[Case], quick: bool) -> list[Outcome]:

@@ -119,7 +119,7 @@ def speed_error(
     folder = _folder(out, quick)
     announce()
     about = _machine()
-    rows = page.measure(quick)
+    rows = page.measure(quick, _tell)
     about["load_after"] = load()
     written = page.write(folder, rows, about, quick)
     if as_json:
@@ -155,7 +155,7 @@ def stability(
     folder = _folder(out, quick)
     announce()
     about = _machine()
-    outcomes = hard.measure(quick)
+    outcomes = hard.measure(quick, _tell)
     about["load_after"] = load()
     written = hard.write(folder, outcomes, about, quick)
     if as_json:
