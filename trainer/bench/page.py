@@ -38,7 +38,7 @@ Rows = Mapping[str, Sequence[Row]]
 
 def measure(quick: bool, tell: Callable[[str], None]) -> dict[str, list[Row]]:
     """All subjects, one after the other; ``tell`` is told which one it is at."""
-    found = {}
+    found: dict[str, list[Row]] = {}
     for name in SUBJECTS:
         tell(f"{SUBJECTS[name].title}, {len(found) + 1} of {len(SUBJECTS)}")
         found[name] = import_module(f"trainer.bench.{name}").measure(quick)

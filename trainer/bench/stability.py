@@ -63,7 +63,7 @@ Outcomes = Mapping[str, Sequence[Outcome]]
 
 def measure(quick: bool, tell: Callable[[str], None]) -> dict[str, list[Outcome]]:
     """All cases of all subjects, one after the other; ``tell`` is told which one it is at."""
-    found = {}
+    found: dict[str, list[Outcome]] = {}
     for name in SUBJECTS:
         tell(f"{SUBJECTS[name]}, {len(found) + 1} of {len(SUBJECTS)}")
         found[name] = collect(import_module(f"trainer.bench.{name}").cases(), quick)
