@@ -81,7 +81,14 @@ class View(ABC):
 
     @abstractmethod
     def uncut(self, structure: str, place_mm: Array) -> Array:
-        """Where the elements (k, 3) mm of a structure are that no cut near ``place_mm`` of the scene has met."""
+        """Where the elements (k, 3) mm of a structure are that no cut near ``place_mm`` of the scene has met.
+
+        Where there are none, those by which the structure holds together still.
+        """
+
+    @abstractmethod
+    def free_mm(self, place: Array, way: Array, most_mm: float) -> float:
+        """How far a tip may go from ``place`` (3,) along the unit vector ``way`` (3,) and meet nothing rigid."""
 
     @abstractmethod
     def in_sight(self, structure: str, eye: Array) -> Array | None:

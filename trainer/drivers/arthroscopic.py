@@ -25,8 +25,8 @@ PULL_BEYOND = 1.15  # a pull goes so much further than the step asks: tissue giv
 SNIP_MM = 4.0  # how far scissors go on after each snip
 ROW_MM = 2.0  # to either side, what one row of snips cuts
 OVERLAP_MM = 1.5  # a row goes so far beyond the nearest edge of what is left
-STRANDS_MM = (0.0, 3.0, -3.0, 6.0, -6.0)  # where strands are sought that cannot be seen
 EDGE_MM = 1.0  # and so much further ahead
+SHIFTS_MM = (0.0, 1.0, -1.0, 2.0, -2.0)  # a row that meets bone is moved so far aside: open blades reach as far
 MOST_ROWS = 12
 TRIES = 5  # at catching tissue
 INSIDE = 0.2  # detours in the joint, which is narrow, as a share of those outside
@@ -106,29 +106,42 @@ class ArthroscopicHands(Hands):
         """Snip across the structure at its mark, a row beside the other, until it is severed."""
         tool, done, place = self._scissors, self._view.steps_done, np.array(step.place_mm)
         mark = self._view.tissue(step.structure, place) + self._miss()
-        ahead, aside = self._home[tool].matrix[:, 0], self._home[tool].matrix[:, 1]
+        ahead, aside, across = self._home[tool].matrix.T
         before = math.inf
-        for strand in range(MOST_ROWS):
+        for _ in range(MOST_ROWS):
             left = self._view.uncut(step.structure, place) - mark
-            if 0 < len(left) < before:  # what still holds and is nearest
-                nearest = min((left @ aside).tolist(), key=abs)
-                row = nearest + math.copysign(OVERLAP_MM, nearest)
-                depth = (left @ ahead)[np.abs(left @ aside - row) < ROW_MM]
-                nearest, farthest = float(depth.min()), float(depth.max()) + EDGE_MM
-            else:  # a strand that cannot be seen
-                row = STRANDS_MM[strand % len(STRANDS_MM)]
-                nearest, farthest = -SNIP_MM, 2.0 * SNIP_MM
-            before = len(left) or math.inf
-            yield from self._snip_through(mark + row * aside, nearest, farthest)
+            if not len(left):
+                break
+            nearest = min((left @ aside).tolist(), key=abs)  # what still holds
+            row = nearest + math.copysign(OVERLAP_MM, nearest)
+            here = left[np.abs(left @ aside - row) < ROW_MM]
+            level = 0.0
+            if len(left) >= before:  # in vain: cut it where it is, beside the mark's level, and then go on as before
+                level = min((here @ across).tolist(), key=abs)
+            before = math.inf if level else len(left)
+            depth = here @ ahead
+            start = mark + row * aside + level * across
+            yield from self._snip_through(start, float(depth.min()), float(depth.max()) + EDGE_MM)
             if self._view.steps_done > done:
                 return
         raise Lost("the tissue is not cut through")
 
     def _snip_through(self, place: Array, nearest: float, farthest: float) -> Movement:
-        """One row of snips, a little further each time, from ``nearest`` to ``farthest`` mm ahead of ``place``."""
+        """One row of snips, a little further each time, from ``nearest`` to ``farthest`` mm ahead of ``place``.
+
+        Where something rigid is in the way the row is moved a little aside, for the blades are open as far, and ends
+        before it.
+        """
         tool, done = self._scissors, self._view.steps_done
-        ahead = self._home[tool].matrix[:, 0]
-        deep = nearest + SNIP_MM
+        ahead, aside = self._home[tool].matrix[:, 0], self._home[tool].matrix[:, 1]
+        behind = nearest + SNIP_MM - STAND_OFF_MM
+        starts = [place + shift * aside + behind * ahead for shift in SHIFTS_MM]
+        free = [behind + self._view.free_mm(start, ahead, farthest - behind) for start in starts]
+        best = int(np.argmax(free))
+        if free[best] <= nearest:
+            raise Lost("something rigid is in the way of the scissors")
+        place, farthest = place + SHIFTS_MM[best] * aside, free[best]
+        deep = min(nearest + SNIP_MM, farthest)
         yield from self._reach(tool, place + deep * ahead)
         while True:
             yield from self._jaws(tool, 1.0)

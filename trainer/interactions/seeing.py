@@ -97,6 +97,12 @@ class SceneView(View):
         assert world.region is not None
         return world.world_from_scene.apply(world.region.places(sight.uncut_at(world.region, structure, place_mm)))
 
+    def free_mm(self, place: Array, way: Array, most_mm: float) -> float:
+        world = self._world
+        assert world.region is not None
+        inwards = world.scene_from_world
+        return sight.free_mm(world.region, inwards.apply(place), inwards.rotate(way), most_mm)
+
     def in_sight(self, structure: str, eye: Array) -> Array | None:
         world = self._world
         assert world.region is not None
