@@ -40,9 +40,12 @@ def list_(
     if as_json:
         print(json.dumps([_summary_json(s) for s in found], indent=2))
         return
+    several = len({s.anatomy for s in found} - {""}) > 1  # then the task alone does not tell what was practised
     rows = [
-        (s.id, _local(s.started_at), s.trainee, s.task, s.device, _ending(s), f"{s.duration_s:.1f} s") for s in found
-    ]
+        (s.id, _local(s.started_at), s.trainee, f"{s.task} in {s.anatomy}" if several and s.anatomy else s.task,
+         s.device, _ending(s), f"{s.duration_s:.1f} s")
+        for s in found
+    ]  # fmt: skip
     print_table(("session", "started", "trainee", "task", "device", "outcome", "duration"), rows)
 
 
@@ -65,7 +68,8 @@ def show(
         print(json.dumps(_session_json(summary, record, metrics, events), indent=2))
         return
     header = record.header
-    print(f"{summary.id}: {header.task} by {header.trainee}, {_ending(summary)} after {summary.duration_s:.2f} s")
+    task = f"{header.task} in {header.anatomy}" if header.anatomy else header.task
+    print(f"{summary.id}: {task} by {header.trainee}, {_ending(summary)} after {summary.duration_s:.2f} s")
     if summary.reason:
         print(f"  reason     {summary.reason}")
     print(f"  started    {_local(header.started_at)}")

@@ -19,8 +19,8 @@ from trainer.log.record import SessionRecord
 from trainer.metrics import score
 
 SESSIONS = (
-    "session", "trainee", "task", "task_sha256", "device", "seed", "started_at", "status", "outcome", "ticks",
-    "tick_hz", "duration_s", "trainer_version",
+    "session", "trainee", "task", "task_sha256", "anatomy", "anatomy_sha256", "device", "seed", "started_at",
+    "status", "outcome", "ticks", "tick_hz", "duration_s", "trainer_version",
 )  # fmt: skip
 EVENTS = ("session", "tick", "seq", "time_s", "tool", "kind", "data_json")
 METRICS = ("session", "metric", "value", "unit", "target_low", "target_high", "source", "version")
@@ -33,8 +33,8 @@ def session_rows(record: SessionRecord) -> Iterator[Row]:
     """One row: who did what when, and how it ended."""
     h = record.header
     yield (
-        h.id, h.trainee, h.task, h.task_sha256, h.device, h.seed, h.started_at, record.status, record.outcome,
-        record.ticks, h.tick_hz, record.duration_s, h.versions.get("trainer", ""),
+        h.id, h.trainee, h.task, h.task_sha256, h.anatomy, h.anatomy_sha256, h.device, h.seed, h.started_at,
+        record.status, record.outcome, record.ticks, h.tick_hz, record.duration_s, h.versions.get("trainer", ""),
     )  # fmt: skip
 
 

@@ -13,7 +13,7 @@ from sqlite_utils import Database
 
 from trainer import events
 from trainer.geometry import Array
-from trainer.log.record import Metric, SessionHeader, SessionRecord
+from trainer.log.record import Metric, SessionHeader, SessionRecord, anatomy_name
 from trainer.log.schema import LogError, clear_errors, open_log, path_of, trainee_name
 from trainer.poses import NUMBERS_PER_TOOL
 
@@ -29,6 +29,7 @@ class Summary:
     id: str
     trainee: str
     task: str
+    anatomy: str  # the knee that was practised in, "" where the task has none
     device: str
     seed: int
     started_at: str  # UTC, ISO 8601
@@ -147,7 +148,8 @@ def _header(row: dict[str, Any]) -> SessionHeader:
 
 
 def _summary(row: dict[str, Any]) -> Summary:
-    values = {f.name: row[f.name] for f in fields(Summary)}
+    values = {f.name: row[f.name] for f in fields(Summary) if f.name != "anatomy"}
     for name in ("realtime", "device_summary"):
         values[name] = json.loads(row[name]) if row[name] is not None else None
-    return Summary(**(values | {"trainee": row["name"]}))
+    versions = json.loads(row["versions"])
+    return Summary(**(values | {"trainee": row["name"], "anatomy": anatomy_name(versions)}))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 
@@ -16,6 +18,13 @@ from trainer.poses import ToolPoses
 TOLERANCE = "tolerance_mN"
 #: The keys that hold the knee that was practised in, a name or a folder, and what its fingerprint was then.
 ANATOMY, ANATOMY_SHA256 = "anatomy", "anatomy_sha256"
+
+
+def anatomy_name(versions: Mapping[str, str]) -> str:
+    """What a reader calls the knee of a session: an imported one as its folder; "" where there is none."""
+    reference = versions.get(ANATOMY, "")
+    name = Path(reference).name
+    return f"built-in {name}" if name and name == reference else name
 
 
 @dataclass(frozen=True)
@@ -36,6 +45,16 @@ class SessionHeader:
     started_at: str  # UTC, ISO 8601
     versions: dict[str, str]  # trainer, python, numpy, numba, machine; the keys above where the scene has such
     recording: str | None  # path of the .rrd
+
+    @property
+    def anatomy(self) -> str:
+        """What the knee is called that was practised in; "" where the task has none."""
+        return anatomy_name(self.versions)
+
+    @property
+    def anatomy_sha256(self) -> str:
+        """Which knee it was, wherever its folder lies; "" where the task has none."""
+        return self.versions.get(ANATOMY_SHA256, "")
 
 
 @dataclass(frozen=True)

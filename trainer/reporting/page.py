@@ -52,7 +52,7 @@ def session_page(report: SessionReport) -> str:
     targets = _target_table(report.targets, sources)
     return _fill(
         "session.html",
-        page_title=escape(f"{report.task_title}, {report.trainee}"),
+        page_title=escape(f"{wording.within(report.task_title, report.anatomy)}, {report.trainee}"),
         style=_template("style.css").template,
         task_title=escape(report.task_title),
         outcome=escape(report.outcome),
@@ -63,6 +63,7 @@ def session_page(report: SessionReport) -> str:
             ("Duration", wording.duration(report.duration_s)),
             ("Device", report.device),
             ("Task", report.task),
+            *((("Knee", report.anatomy),) if report.anatomy else ()),
             ("Session", report.session),
         ),
         summary=escape(session_summary(report)),
@@ -79,6 +80,7 @@ def progress_page(report: ProgressReport) -> str:
     sources = Sources()
     tasks = "".join(_task_section(t, sources) for t in report.tasks)
     attempts = sum(len(t.attempts) for t in report.tasks)
+    notes = [COMPLETED_ONLY] + ([wording.KNEES_APART] if report.several_knees else [])
     first, last = (wording.date(t).partition(",")[0] for t in (report.first_at, report.last_at))
     return _fill(
         "progress.html",
@@ -88,7 +90,7 @@ def progress_page(report: ProgressReport) -> str:
         count=f"{attempts} session{'s' if attempts != 1 else ''}",
         period=first if first == last else f"{first} to {last}",
         tasks=tasks,
-        footer=sources.footnotes() + f"<p>{COMPLETED_ONLY}</p>" + _closing({}, 0),
+        footer=sources.footnotes() + f"<p>{' '.join(notes)}</p>" + _closing({}, 0),
     )
 
 
@@ -225,7 +227,7 @@ def _task_section(task: TaskProgress, sources: Sources) -> str:
     sessions = f"the last {task.map_sessions} sessions" if task.map_sessions > 1 else "the last session"
     return _fill(
         "task.html",
-        task_title=escape(task.title),
+        task_title=escape(wording.within(task.title, task.anatomy)),
         summary=escape(task_summary(task)),
         curves=curves,
         rows=_progress_table(task.rows, sources),

@@ -33,7 +33,7 @@ STRIP_ATTEMPTS = 5
 class Attempt:
     """One session of a task."""
 
-    number: int  # from 1, among all sessions of the task
+    number: int  # from 1, among all sessions of the task in its knee
     session: str
     started_at: str
     outcome: str
@@ -69,10 +69,11 @@ class ProgressRow:
 
 @dataclass(frozen=True)
 class TaskProgress:
-    """All attempts of one trainee at one task."""
+    """All attempts of one trainee at one task, in one knee where it has such."""
 
     task: str
     title: str
+    anatomy: str  # the knee; empty where the task has none
     attempts: tuple[Attempt, ...]
     curves: tuple[Curve, ...]
     rows: tuple[ProgressRow, ...]
@@ -93,7 +94,12 @@ class ProgressReport:
     trainee: str
     first_at: str
     last_at: str
-    tasks: tuple[TaskProgress, ...]
+    tasks: tuple[TaskProgress, ...]  # one for each knee that a task was practised in, beside each other
+
+    @property
+    def several_knees(self) -> bool:
+        """Whether a task was practised in more than one."""
+        return len({t.task for t in self.tasks}) < len(self.tasks)
 
 
 def progress_report(records: Iterable[SessionRecord]) -> ProgressReport:
@@ -101,23 +107,32 @@ def progress_report(records: Iterable[SessionRecord]) -> ProgressReport:
 
     A session that still runs is left out. A task is judged by the text of its last session.
     """
-    by_task: dict[str, list[SessionRecord]] = {}
-    for record in sorted(records, key=lambda r: (r.header.started_at, r.header.id)):
-        if record.status != "running":
-            by_task.setdefault(record.header.task, []).append(record)
-    if not by_task:
+    ended = sorted((r for r in records if r.status != "running"), key=lambda r: (r.header.started_at, r.header.id))
+    if not ended:
         raise ValueError("no session has ended yet")
-    times = sorted(r.header.started_at for rs in by_task.values() for r in rs)
-    some = next(iter(by_task.values()))[0]
+    by_task: dict[str, dict[str, list[SessionRecord]]] = {}
+    for record in ended:
+        by_task.setdefault(record.header.task, {}).setdefault(record.header.anatomy_sha256, []).append(record)
     return ProgressReport(
-        trainee=some.header.trainee,
-        first_at=times[0],
-        last_at=times[-1],
-        tasks=tuple(_task_progress(name, rs) for name, rs in by_task.items()),
+        trainee=ended[0].header.trainee,
+        first_at=ended[0].header.started_at,
+        last_at=ended[-1].header.started_at,
+        tasks=tuple(
+            _task_progress(name, records, knee) for name, knees in by_task.items() for knee, records in _named(knees)
+        ),
     )
 
 
-def _task_progress(name: str, records: list[SessionRecord]) -> TaskProgress:
+def _named(knees: dict[str, list[SessionRecord]]) -> list[tuple[str, list[SessionRecord]]]:
+    """The sessions in each knee after its name, as it was called last; knees of one name tell their fingerprints."""
+    names = [records[-1].header.anatomy for records in knees.values()]
+    return [
+        (f"{name}, {knee[:8]}" if names.count(name) > 1 else name, records)
+        for name, (knee, records) in zip(names, knees.items(), strict=True)
+    ]
+
+
+def _task_progress(name: str, records: list[SessionRecord], knee: str) -> TaskProgress:
     last = records[-1].header
     task = parse_task(last.task_toml, last.task)
     scored = [score(r, task) for r in records]
@@ -131,6 +146,7 @@ def _task_progress(name: str, records: list[SessionRecord]) -> TaskProgress:
     return TaskProgress(
         task=name,
         title=task.title,
+        anatomy=knee,
         attempts=attempts,
         curves=tuple(_curve(n, attempts, task) for n in CURVES if n in names),
         rows=tuple(_row(metric_row(m, task), definition_of(m.name, task), attempts) for m in wanted),

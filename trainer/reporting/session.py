@@ -122,6 +122,7 @@ class SessionReport:
     trainee: str
     task: str
     task_title: str
+    anatomy: str  # the knee that was practised in; empty where the task has none
     started_at: str
     device: str
     status: str
@@ -154,6 +155,7 @@ def session_report(record: SessionRecord, task: Task) -> SessionReport:
         trainee=header.trainee,
         task=header.task,
         task_title=task.title,
+        anatomy=header.anatomy,
         started_at=header.started_at,
         device=header.device,
         status=record.status,

@@ -24,7 +24,8 @@ _STRIP = "scale"
 
 def print_session(report: SessionReport, console: Console) -> None:
     """One session: outcome, targets, bites, everything else that was measured, events."""
-    console.print(f"[bold]{escape(report.task_title)}[/bold]  {escape(report.outcome)}")
+    title = wording.within(report.task_title, report.anatomy)
+    console.print(f"[bold]{escape(title)}[/bold]  {escape(report.outcome)}")
     console.print(
         f"{escape(report.trainee)}, {wording.date(report.started_at)}, {wording.duration(report.duration_s)}, "
         f"{report.steps_done} of {report.steps} steps, {escape(report.device)}, session {escape(report.session)}"
@@ -50,10 +51,13 @@ def print_progress(report: ProgressReport, console: Console) -> None:
     """A trainee's attempts at each task."""
     console.print(f"[bold]{escape(report.trainee)}[/bold]")
     for task in report.tasks:
-        console.print(f"\n[bold]{escape(task.title)}[/bold]\n{escape(task_summary(task))}")
+        title = wording.within(task.title, task.anatomy)
+        console.print(f"\n[bold]{escape(title)}[/bold]\n{escape(task_summary(task))}")
         for curve in task.curves:
             console.print(f"  {curve.title:<18} {spark(curve)}  {escape(curve_words(curve))}")
         _print_progress(task, console)
+    if report.several_knees:
+        console.print(f"\n{wording.KNEES_APART}")
     assumed = {r.last.source: r.last for t in report.tasks for r in t.rows if r.last.assumed}
     _print_notes(list(assumed.values()), console)
 

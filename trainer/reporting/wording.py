@@ -38,6 +38,8 @@ from trainer.events import (
 
 DISCLAIMER = "Training feedback, not a certificate."
 
+KNEES_APART = "Attempts at a task in different knees are counted apart: what is hard in one may be easy in the other."
+
 #: So many reasons why a device did not see an instrument are told in one line.
 MOST_REASONS = 3
 
@@ -51,6 +53,11 @@ def title(metric: str) -> str:
         metric = metric.removesuffix(suffix)
     words = metric.replace("_", " ")
     return words[:1].upper() + words[1:]
+
+
+def within(title: str, anatomy: str) -> str:
+    """A task's title with the knee that it was practised in, where it has one."""
+    return f"{title} – {anatomy}" if anatomy else title
 
 
 def unit_word(unit: str) -> str:
