@@ -18,7 +18,7 @@ from trainer.cli.sessions import app
 from trainer.curriculum import Task
 from trainer.events import Event, TickOverrun
 from trainer.log import reader
-from trainer.log.record import Metric, SessionRecord
+from trainer.log.record import ANATOMY, Metric, SessionRecord
 from trainer.log.schema import LogError, open_log
 from trainer.poses import ToolPoses
 from trainer.sinks.log import LogSink
@@ -40,6 +40,20 @@ def answer(*arguments: str, exit_code: int = 0) -> object:
     got = runner.invoke(app, [*arguments, "--json"])
     assert got.exit_code == exit_code, got.output
     return json.loads(got.stdout)
+
+
+def test_the_list_tells_knees_where_there_are_several(path: Path) -> None:
+    """One knee throughout needs no word; JSON has it always."""
+
+    def listed(number: int, knee: str) -> str:
+        write(path, f"20261122-03000{number}-0000", versions={"trainer": "0.1.0", ANATOMY: knee})
+        return " ".join(runner.invoke(app, ["list"]).stdout.split())
+
+    assert " in " not in listed(1, "knee")
+    both = listed(2, "/data/my-knee")
+    assert "anastomosis/needle-drive in built-in knee" in both
+    assert "anastomosis/needle-drive in my-knee" in both
+    assert [s["anatomy"] for s in answer("list")] == ["", "", "built-in knee", "my-knee"]
 
 
 def complaint(*arguments: str) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -64,9 +65,9 @@ def test_sessions_of_different_tasks_share_the_files(tmp_path: Path) -> None:
 def test_columns_with_a_unit_say_it() -> None:
     columns = [c for names, _ in FILES.values() for c in names]
     plain = {
-        "session", "trainee", "task", "task_sha256", "device", "seed", "started_at", "status", "outcome", "ticks",
-        "trainer_version", "tick", "seq", "tool", "kind", "data_json", "metric", "value", "unit", "target_low",
-        "target_high", "source", "version", "qw", "qx", "qy", "qz", "closure", "valid",
+        "session", "trainee", "task", "task_sha256", "anatomy", "anatomy_sha256", "device", "seed", "started_at",
+        "status", "outcome", "ticks", "trainer_version", "tick", "seq", "tool", "kind", "data_json", "metric", "value",
+        "unit", "target_low", "target_high", "source", "version", "qw", "qx", "qy", "qz", "closure", "valid",
     }  # fmt: skip
     for column in set(columns) - plain:
         assert column.rpartition("_")[2] in {"s", "mm", "hz"}, column
@@ -98,3 +99,12 @@ def test_a_full_disk_is_told_with_the_name_of_the_file(tmp_path: Path, monkeypat
 
 def test_an_empty_folder_may_be_filled(tmp_path: Path) -> None:
     assert write([record()], tmp_path)["sessions.csv"] == 1
+
+
+def test_sessions_tell_their_knee(tmp_path: Path) -> None:
+    """Its name, and which it is, wherever it lies; both are empty where a task has none."""
+    made = record(session="b")
+    versions = {"anatomy": "/data/my-knee", "anatomy_sha256": "ab" * 32}
+    write([record(), replace(made, header=replace(made.header, versions=versions))], tmp_path / "out")
+    found = [(r["anatomy"], r["anatomy_sha256"]) for r in rows(tmp_path / "out" / "sessions.csv")]
+    assert found == [("", ""), ("my-knee", "ab" * 32)]

@@ -13,8 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
-from tests.metrics.synthetic_session import DRIVE, performed, record, stitch
-from trainer.log.record import SessionRecord
+from tests.metrics.synthetic_session import DRIVE, at, performed, record, stitch
+from trainer.events import StepDone, TaskDone
+from trainer.log.record import ANATOMY, ANATOMY_SHA256, SessionRecord
 from trainer.metrics.learning import recent, trend
 from trainer.reporting import terminal, wording
 from trainer.reporting.page import progress_page
@@ -139,3 +140,57 @@ def test_the_terminal_shows_each_curve() -> None:
     said = console.export_text()
     assert "█▆▄" in said  # errors 40, 30 and 20 degrees: full, three quarters, half
     assert "3 attempts, 3 completed." in said
+
+
+def in_knee(number: int, reference: str, fingerprint: str) -> SessionRecord:
+    """A session of the knee, a day after the one before."""
+    made = record(
+        session=f"S-{number}", reference="arthroscopy/probe-landmarks",
+        started_at=f"2026-10-{number + 1:02d}T09:00:00+00:00",
+    )  # fmt: skip
+    versions = {ANATOMY: reference, ANATOMY_SHA256: fingerprint}
+    return dataclasses.replace(made, header=dataclasses.replace(made.header, versions=versions))
+
+
+BUILT_IN, OWN = ("knee", "aa" * 32), ("/data/my-knee", "bb" * 32)
+
+
+def test_each_knee_has_attempts_and_curves_of_its_own() -> None:
+    """In whatever order they were practised in, a knee that was moved is the same, and one of the same name is not."""
+    places = [BUILT_IN, OWN, BUILT_IN, ("/moved/my-knee", OWN[1]), ("/other/my-knee", "cc" * 32)]
+    found = progress_report([in_knee(i, *place) for i, place in enumerate(places)])
+    assert [(t.anatomy, [a.session for a in t.attempts], [a.number for a in t.attempts]) for t in found.tasks] == [
+        ("built-in knee", ["S-0", "S-2"], [1, 2]),
+        ("my-knee, bbbbbbbb", ["S-1", "S-3"], [1, 2]),
+        ("my-knee, cccccccc", ["S-4"], [1]),
+    ]
+    contacts = [next(c for c in t.curves if c.name == "iatrogenic_contact_count") for t in found.tasks]
+    assert [(c.title, len(c.values)) for c in contacts] == [("Iatrogenic contact count", n) for n in (2, 2, 1)]
+    console = Console(record=True, width=120, file=io.StringIO())
+    terminal.print_progress(found, console)
+    for said in (console.export_text(), progress_page(found)):
+        assert said.count("Touch the landmarks of the knee – ") == 3
+        assert wording.KNEES_APART in " ".join(said.split())
+
+
+def test_one_knee_is_named_once_and_nothing_is_said_of_others() -> None:
+    found = progress_report([in_knee(i, *OWN) for i in range(3)])
+    assert [(t.anatomy, len(t.attempts)) for t in found.tasks] == [("my-knee", 3)]
+    page = progress_page(found)
+    assert page.count("my-knee") == 1
+    assert wording.KNEES_APART not in page
+    assert wording.KNEES_APART not in progress_page(progress_report(attempts([50.0, 60.0])))
+
+
+def test_what_has_no_better_value_has_no_best() -> None:
+    """How far tissue draws back is told, and is neither good nor bad."""
+    nowhere = (0.0, 0.0, 0.0)
+    cut = StepDone(**at(1), step="cut it through", index=3)
+    end = TaskDone(
+        **at(2), outcome="completed", reason="", needle_tip=nowhere, needle_tangent=nowhere, thread_end=nowhere,
+        thread_length_error=0.0, tail_mm=0.0, gap_mm=2.5,
+    )  # fmt: skip
+    found = progress_report([record((cut, end), reference="arthroscopy/ligament-release")])
+    rows = {r.last.name: r for r in found.tasks[0].rows}
+    assert (rows["retraction_mm"].last.value, rows["retraction_mm"].best) == (2.5, None)
+    assert rows["iatrogenic_contact_count"].best == 0.0

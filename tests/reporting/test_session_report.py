@@ -16,7 +16,8 @@ from rich.console import Console
 from tests.metrics.synthetic_session import DRIVE, at, performed, pierce, record, stitch, task_of
 from tests.metrics.synthetic_session import withdraw as withdrawn
 from trainer.curriculum import load_task, parse_task
-from trainer.events import KINDS, Aborted, Contact, Overforce, TickOverrun, TrackingBack, TrackingLost
+from trainer.events import KINDS, Aborted, Contact, Grasp, Overforce, Probe, TickOverrun, TrackingBack, TrackingLost
+from trainer.log.record import ANATOMY, ANATOMY_SHA256
 from trainer.reporting import figures, terminal, wording
 from trainer.reporting.page import session_page
 from trainer.reporting.session import MetricRow, SessionReport, event_lines, session_report
@@ -285,3 +286,32 @@ def test_what_was_out_of_sight_is_said_once_for_hands_that_were_lost_alike() -> 
     assert wording.out_of_sight([*gone, *back, again]) == (
         "left not seen by the device for 0.20 s, then lost again: a; b; right not seen by the device for 0.20 s: a"
     )
+
+
+def test_the_knee_and_what_was_touched_without_being_asked_for_are_told() -> None:
+    touch = Probe(**at(1), body="femur", point=(0.0, 0.0, 0.0))
+    grip = Grasp(**at(2), target="tissue", body="posterior cruciate ligament", arc_mm=0.0, point=(0.0, 0.0, 0.0),
+                 force_mN=50000.0)  # fmt: skip
+    made = record((touch, grip), reference="arthroscopy/ligament-release")
+    versions = {ANATOMY: "/data/<my> knee", ANATOMY_SHA256: "bb" * 32}
+    made = dataclasses.replace(made, header=dataclasses.replace(made.header, versions=versions))
+    report = session_report(made, task_of("arthroscopy/ligament-release"))
+    assert [(r.structure, r.asked) for r in report.tissue] == [("posterior cruciate ligament", True), ("femur", False)]
+    page = session_page(report)
+    assert "<dt>Knee</dt><dd>&lt;my&gt; knee</dd>" in page
+    assert page.count("not part of the task") == 1
+    assert "50000" not in page  # what the jaws can hold is no force that was measured
+    assert ">tacked<" not in page
+    console = Console(record=True, width=120, file=io.StringIO())
+    terminal.print_session(report, console)
+    said = console.export_text()
+    assert said.startswith("Release a ligament of the knee – <my> knee")
+    assert "femur not part of the task" in said
+
+
+@pytest.mark.parametrize(
+    ("value", "high", "said", "target"),
+    [(999.94, 60.0, "999.9 mN", "0 to 60 mN"), (20329.7, 30000.0, "20.3 N", "0 to 30 N")],
+)
+def test_large_forces_are_in_newtons(value: float, high: float, said: str, target: str) -> None:
+    assert (wording.quantity(value, "mN"), wording.band(0.0, high, "mN")) == (said, target)

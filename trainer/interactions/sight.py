@@ -50,7 +50,7 @@ def _strands(region: Region, elements: Indices, height: Array, axis: int) -> Ind
     """
     near = np.abs(height) <= LEVEL_MM
     slab, height = elements[near], height[near]
-    edge = LEVEL_MM - 2.0 * region.volume.spacing_mm[axis]
+    edge = LEVEL_MM - region.volume.spacing_mm[axis]
     both = (2 * axis, 2 * axis + 1)
     below = _linked(region, slab, slab[height < -edge], both)
     above = np.setdiff1d(_linked(region, slab, slab[height > edge], both), below)
@@ -71,7 +71,8 @@ def _linked(region: Region, among: Indices, start: Indices, steps: Iterable[int]
 
 def _neighbours(region: Region, elements: Indices, step: int) -> Indices:
     """Those that ``elements`` (k,) are linked to in one of the six directions."""
-    return elements[(region.state.links[elements] & (1 << step)) != 0] + grid_strides(region.volume)[step]
+    linked = elements[(region.state.links[elements] & (1 << step)) != 0]
+    return np.asarray(linked + grid_strides(region.volume)[step], dtype=np.int32)
 
 
 def free_mm(region: Region, place: Array, way: Array, most_mm: float) -> float:

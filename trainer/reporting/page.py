@@ -16,13 +16,16 @@ from trainer.data_files import data_folder
 from trainer.reporting import figures, wording
 from trainer.reporting.progress import Attempt, Curve, ProgressReport, ProgressRow, TaskProgress
 from trainer.reporting.session import EventLine, Histogram, MetricRow, SessionReport, StitchMap, TissueRow
-from trainer.reporting.summary import curve_words, session_summary, task_summary
+from trainer.reporting.summary import NOT_ASKED, curve_words, session_summary, task_summary, tissue_columns
 
 MAP_CAPTION = (
     "Each vessel end around its cut edge, 3 o'clock on the same side of both. Distance from the inner circle is the "
     "bite in mm; the number is the pass; a dot with a dashed edge was left again."
 )
-COMPLETED_ONLY = "Curves and best values count completed attempts only; the others stopped at another place."
+COMPLETED_ONLY = (
+    "Curves and best values count completed attempts only; the others stopped at another place. In a curve the thick "
+    "line is the median of the last three, the dashed one the slope."
+)
 
 
 class Sources:
@@ -187,15 +190,9 @@ def _where(
 
 
 def _tissue_table(rows: tuple[TissueRow, ...]) -> str:
-    names = ("grasps", "tip contacts", "tacked", "cut", "torn")
-    return _table(
-        (("Structure", ""), *((name, "n") for name in names)),
-        (
-            [escape(r.structure), str(r.grasps), str(r.contacts)]
-            + [wording.quantity(v, "mm3") for v in (r.tacked_mm3, r.cut_mm3, r.torn_mm3)]
-            for r in rows
-        ),
-    )
+    columns = tissue_columns(rows)
+    names = [escape(r.structure) + ("" if r.asked else f' <span class="missed">{NOT_ASKED}</span>') for r in rows]
+    return _table((("Structure", ""), *((name, "n") for name in columns)), zip(names, *columns.values(), strict=True))
 
 
 def _stitch_words(shown: StitchMap) -> str:

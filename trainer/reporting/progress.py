@@ -10,6 +10,7 @@ from trainer.log.record import SessionRecord
 from trainer.metrics import Definition, definition_of, score
 from trainer.metrics.learning import Trend, recent, trend
 from trainer.metrics.performance import Performance
+from trainer.reporting import wording
 from trainer.reporting.session import (
     Histogram,
     MetricRow,
@@ -22,7 +23,7 @@ from trainer.reporting.session import (
 )
 
 #: Metrics that have a learning curve.
-CURVES = ("time_s", "entry_angle_error_deg")
+CURVES = ("time_s", "entry_angle_error_deg", "iatrogenic_contact_count")
 #: How many of the last sessions the stitch map shows.
 MAP_SESSIONS = 5
 #: How many attempts a strip shows beside the last.
@@ -166,12 +167,12 @@ def _curve(name: str, attempts: tuple[Attempt, ...], task: Task) -> Curve:
     definition = definition_of(name, task)
     points = _points(name, attempts)
     numbers, values = tuple(n for n, _ in points), tuple(v for _, v in points)
-    title = "Time" if name == "time_s" else "Entry angle error"
-    return Curve(name, title, definition.unit, numbers, values, recent(values), trend(numbers, values))
+    return Curve(name, wording.title(name), definition.unit, numbers, values, recent(values), trend(numbers, values))
 
 
 def _row(last: MetricRow, definition: Definition, attempts: tuple[Attempt, ...]) -> ProgressRow:
-    points = _points(last.name, attempts)
+    judged = last.has_target or definition.better
+    points = _points(last.name, attempts) if judged else []  # else no value is better than another
     best = min(points, key=lambda p: (*_distance(p[1], last, definition), -p[0]), default=None)
     before = [v for a in attempts[:-1] if (v := a.values.get(last.name)) is not None]
     return ProgressRow(

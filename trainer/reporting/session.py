@@ -96,6 +96,7 @@ class TissueRow:
     """What was done to one structure of a region."""
 
     structure: str
+    asked: bool  # whether a step of the task names it
     grasps: int
     contacts: int  # of an instrument's tip with what is rigid
     tacked_mm3: float
@@ -236,6 +237,7 @@ def tissue_rows(performance: Performance) -> tuple[TissueRow, ...]:
     return tuple(
         TissueRow(
             structure=name,
+            asked=any(s.structure == name for s in performance.task.step),
             grasps=sum(isinstance(e, Grasp) and e.body == name for e in done),
             contacts=sum(isinstance(e, Probe) and e.body == name for e in done),
             tacked_mm3=volume(Tack, name),

@@ -6,7 +6,10 @@ from collections.abc import Sequence
 
 from trainer.reporting import wording
 from trainer.reporting.progress import Curve, TaskProgress
-from trainer.reporting.session import MetricRow, SessionReport
+from trainer.reporting.session import MetricRow, SessionReport, TissueRow
+
+#: What is said of a structure that was touched but is in no step of the task.
+NOT_ASKED = "not part of the task"
 
 
 def session_summary(report: SessionReport) -> str:
@@ -34,6 +37,20 @@ def task_summary(task: TaskProgress) -> str:
     rows = [r.last for r in task.rows if r.last.has_target]
     tried = f"{len(task.attempts)} attempt{'s' if len(task.attempts) != 1 else ''}, {task.completed} completed."
     return f"{tried} The last attempt: {_met(rows)}."
+
+
+def tissue_columns(rows: Sequence[TissueRow]) -> dict[str, list[str]]:
+    """What was done to each structure, as columns under their headings, without what was done to none."""
+    counts = {"grasps": [r.grasps for r in rows], "tip contacts": [r.contacts for r in rows]}
+    volumes = {
+        "tacked": [r.tacked_mm3 for r in rows],
+        "cut": [r.cut_mm3 for r in rows],
+        "torn": [r.torn_mm3 for r in rows],
+    }
+    found = {name: [str(n) for n in column] for name, column in counts.items() if any(column)}
+    return found | {
+        name: [wording.quantity(v, "mm3") for v in column] for name, column in volumes.items() if any(column)
+    }
 
 
 def curve_words(curve: Curve) -> str:

@@ -12,8 +12,8 @@ from rich.table import Table
 
 from trainer.reporting import wording
 from trainer.reporting.progress import Curve, ProgressReport, ProgressRow, TaskProgress
-from trainer.reporting.session import Bite, MetricRow, SessionReport, TissueRow
-from trainer.reporting.summary import curve_words, session_summary, task_summary
+from trainer.reporting.session import Bite, MetricRow, SessionReport
+from trainer.reporting.summary import NOT_ASKED, curve_words, session_summary, task_summary, tissue_columns
 
 #: Cells of a target strip.
 _CELLS = 20
@@ -150,14 +150,10 @@ def _print_bites(report: SessionReport, console: Console) -> None:
 def _print_tissue(report: SessionReport, console: Console) -> None:
     if not report.tissue:
         return
-    names = ("grasps", "tip contacts", "tacked", "cut", "torn")
-    head = (("structure", "left"), *((name, "right") for name in names))
-
-    def cells(r: TissueRow) -> list[str]:
-        volumes = [wording.quantity(v, "mm3") for v in (r.tacked_mm3, r.cut_mm3, r.torn_mm3)]
-        return [escape(r.structure), str(r.grasps), str(r.contacts), *volumes]
-
-    _print_rows(head, [cells(r) for r in report.tissue], console)
+    columns = tissue_columns(report.tissue)
+    names = [escape(r.structure) + ("" if r.asked else f" [bold red]{NOT_ASKED}[/bold red]") for r in report.tissue]
+    head = (("structure", "left"), *((name, "right") for name in columns))
+    _print_rows(head, list(zip(names, *columns.values(), strict=True)), console)
 
 
 def _print_others(rows: tuple[MetricRow, ...], console: Console) -> None:

@@ -81,14 +81,19 @@ def clock(angle_deg: float) -> str:
 
 
 def quantity(value: float | None, unit: str) -> str:
-    """A value with its unit."""
+    """A value with its unit; a large force in newtons."""
+    if unit == "mN" and value is not None and abs(value) >= 1000.0:
+        return f"{1e-3 * value:.1f} N"
     word = unit_word(unit)
     gap = "" if word in ("", "°") else " "
     return number(value, unit) + (gap + word if value is not None else "")
 
 
 def band(low: float | None, high: float | None, unit: str) -> str:
-    """A target band in words; empty without a target."""
+    """A target band in words; empty without a target. A large force is in newtons."""
+    if unit == "mN" and max(low or 0.0, high or 0.0) >= 1000.0:
+        low, high = (None if limit is None else 1e-3 * limit for limit in (low, high))
+        unit = "N"
     word = unit_word(unit)
     tail = word if word in ("", "°") else f" {word}"
     if low is not None and high is not None:
@@ -111,7 +116,13 @@ def duration(seconds: float) -> str:
 
 
 def kind_word(kind: str) -> str:
-    return kind.replace("_", " ")
+    """An event's kind for a reader: a tip touches a structure, be it a probe's or not."""
+    return "touch" if kind == "probe" else kind.replace("_", " ")
+
+
+def _force(value: float, unit: str = "mN") -> str:
+    """A force or pressure of an event, in whole millinewtons or, a large one, in newtons."""
+    return quantity(value, unit) if unit == "mN" and value >= 1000.0 else f"{value:.0f} {unit}"
 
 
 def _place(axial_mm: float, clock_deg: float) -> str:
@@ -158,12 +169,14 @@ def _why(reasons: Sequence[str]) -> str:
 def describe(event: Event) -> str:
     """What happened, in a few words; the bare fields of a kind that has no words of its own."""
     match event:
+        case Grasp() if event.target == "tissue":
+            return _held(event.target, event.body)
         case Grasp():
             return f"{_held(event.target, event.body)}, {event.force_mN:.0f} mN"
         case Release():
             return _held(event.target, event.body)
         case Slip():
-            return f"{_held(event.target, event.body)} at {event.load_mN:.0f} mN"
+            return f"{_held(event.target, event.body)} at {_force(event.load_mN)}"
         case Drop():
             return event.target
         case Contact():
@@ -186,9 +199,9 @@ def describe(event: Event) -> str:
         case Cut():
             return f"{event.body}, {event.volume_mm3:.0f} mm³"
         case Tack():
-            return f"{event.body}, {event.volume_mm3:.0f} mm³ at {event.force_mN:.0f} mN"
+            return f"{event.body}, {event.volume_mm3:.0f} mm³ at {_force(event.force_mN)}"
         case Probe():
-            return f"{event.body}, {event.force_mN:.0f} mN" if event.force_mN else event.body
+            return f"{event.body}, {_force(event.force_mN)}" if event.force_mN else event.body
         case PortalEnter():
             return "in through the portal"
         case PortalExit():
@@ -197,7 +210,7 @@ def describe(event: Event) -> str:
             return f"{event.wall} wall of {event.body} at {event.force_mN:.0f} mN"
         case Overforce():
             where = f" on {event.body}" if event.body else ""
-            limit = f"{event.value:.0f} {event.unit}, limit {event.limit:.0f} {event.unit}"
+            limit = f"{_force(event.value, event.unit)}, limit {_force(event.limit, event.unit)}"
             return f"{event.quantity.replace('_', ' ')}{where}: {limit}"
         case TrackingLost():
             return f"not seen by the device{_why([event.reason])}"
