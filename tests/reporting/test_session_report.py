@@ -311,7 +311,7 @@ def test_the_knee_and_what_was_touched_without_being_asked_for_are_told() -> Non
 
 @pytest.mark.parametrize(
     ("value", "high", "said", "target"),
-    [(999.94, 60.0, "999.9 mN", "0 to 60 mN"), (20329.7, 30000.0, "20.3 N", "0 to 30 N")],
+    [(93.9, 1000.0, "93.9 mN", "0 to 1000 mN"), (20329.7, 30000.0, "20.3 N", "0 to 30 N")],
 )
 def test_large_forces_are_in_newtons(value: float, high: float, said: str, target: str) -> None:
     assert (wording.quantity(value, "mN"), wording.band(0.0, high, "mN")) == (said, target)

@@ -194,7 +194,7 @@ def angle_histogram(shown: Histogram) -> str:
 def learning_curve(curve: Curve, attempts: int) -> str:
     """A value over attempts: each attempt, the median of the last three, and Theil and Sen's line."""
     width, height, left, right, top, bottom = 320.0, 190.0, 34.0, 8.0, 12.0, 38.0
-    scale = ticks(0.0, max([1.0 if curve.unit == "count" else 1e-9, *curve.values]), 4)
+    scale = ticks(0.0, max([4.0 if curve.unit == "count" else 1e-9, *curve.values]), 4)
     last = max(attempts, 5)
 
     def x(attempt: float) -> float:

@@ -178,7 +178,8 @@ def _where(
 ) -> dict[str, str]:
     """The figures of what the instruments did: where the needle went, or what was done to which structure."""
     if tissue:
-        return {"map_title": "What was done to which structure", "map": _tissue_table(tissue)}
+        last = " in the last session" if origin else ""
+        return {"map_title": f"What was done to which structure{last}", "map": _tissue_table(tissue)}
     drawn = _fill(
         "needle.html",
         stitch_map=figures.stitch_map(shown),

@@ -65,4 +65,4 @@ def curve_words(curve: Curve) -> str:
     unit = wording.unit_word(curve.unit)
     gap = "" if unit == "°" else " "
     t = curve.trend
-    return said + f" Slope {t.slope:+.1f}{gap}{unit} per attempt (95 %: {t.low:+.1f} to {t.high:+.1f})."
+    return said + f" Slope {t.slope:+.1f}{gap}{unit} per attempt (95\u00a0%: {t.low:+.1f} to {t.high:+.1f})."

@@ -53,8 +53,9 @@ def print_progress(report: ProgressReport, console: Console) -> None:
     for task in report.tasks:
         title = wording.within(task.title, task.anatomy)
         console.print(f"\n[bold]{escape(title)}[/bold]\n{escape(task_summary(task))}")
+        width = max((len(curve.title) for curve in task.curves), default=0)
         for curve in task.curves:
-            console.print(f"  {curve.title:<18} {spark(curve)}  {escape(curve_words(curve))}")
+            console.print(f"  {curve.title:<{width}} {spark(curve)}  {escape(curve_words(curve))}")
         _print_progress(task, console)
     if report.several_knees:
         console.print(f"\n{wording.KNEES_APART}")

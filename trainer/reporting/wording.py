@@ -40,6 +40,9 @@ DISCLAIMER = "Training feedback, not a certificate."
 
 KNEES_APART = "Attempts at a task in different knees are counted apart: what is hard in one may be easy in the other."
 
+#: From here on a force is told in newtons.
+LARGE_MN = 10_000.0
+
 #: So many reasons why a device did not see an instrument are told in one line.
 MOST_REASONS = 3
 
@@ -82,7 +85,7 @@ def clock(angle_deg: float) -> str:
 
 def quantity(value: float | None, unit: str) -> str:
     """A value with its unit; a large force in newtons."""
-    if unit == "mN" and value is not None and abs(value) >= 1000.0:
+    if unit == "mN" and value is not None and abs(value) >= LARGE_MN:
         return f"{1e-3 * value:.1f} N"
     word = unit_word(unit)
     gap = "" if word in ("", "°") else " "
@@ -91,7 +94,7 @@ def quantity(value: float | None, unit: str) -> str:
 
 def band(low: float | None, high: float | None, unit: str) -> str:
     """A target band in words; empty without a target. A large force is in newtons."""
-    if unit == "mN" and max(low or 0.0, high or 0.0) >= 1000.0:
+    if unit == "mN" and max(low or 0.0, high or 0.0) >= LARGE_MN:
         low, high = (None if limit is None else 1e-3 * limit for limit in (low, high))
         unit = "N"
     word = unit_word(unit)
@@ -122,7 +125,7 @@ def kind_word(kind: str) -> str:
 
 def _force(value: float, unit: str = "mN") -> str:
     """A force or pressure of an event, in whole millinewtons or, a large one, in newtons."""
-    return quantity(value, unit) if unit == "mN" and value >= 1000.0 else f"{value:.0f} {unit}"
+    return quantity(value, unit) if unit == "mN" and value >= LARGE_MN else f"{value:.0f} {unit}"
 
 
 def _place(axial_mm: float, clock_deg: float) -> str:
