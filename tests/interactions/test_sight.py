@@ -69,8 +69,8 @@ def test_strands_between_cuts_at_two_levels_are_all_that_holds(step: int) -> Non
 
 @given(st.floats(-30.0, 25.0), st.floats(-30.0, 30.0), st.integers(0, 2**32 - 1))
 def test_a_free_way_meets_nothing_rigid_and_ends_before_what_is(whole: Region, x: float, y: float, seed: int) -> None:
-    """Along it no place is in bone; where it ends early, something rigid is no further than a step of half PAST_MM
-    and PAST_MM to any side."""
+    """Along it and PAST_MM beside it no place is in bone; where it ends early, something rigid is no further than a
+    step of half PAST_MM and PAST_MM to any side."""
     way = np.random.default_rng(seed).normal(size=3)
     way /= np.linalg.norm(way)
     start = np.array([x, y, 0.0])
@@ -79,9 +79,10 @@ def test_a_free_way_meets_nothing_rigid_and_ends_before_what_is(whole: Region, x
         return whole.structure_at(place) not in {"", *whole.elements}
 
     found = free_mm(whole, start, way, 20.0)
+    sides = PAST_MM * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
     if found > 0.0:
-        assert not any(rigid(start + t * way) for t in np.arange(0.0, found, 0.5 * PAST_MM))
+        along = np.arange(0.0, found, 0.5 * PAST_MM)
+        assert not any(rigid(start + t * way + side) for t in along for side in 0.98 * sides)
     if found < 20.0:
-        sides = PAST_MM * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
         ends = [found + k * 0.5 * PAST_MM * 1.01 for k in (0, 1)]
         assert any(rigid(start + t * way + side) for t in ends for side in 1.02 * sides)
