@@ -60,10 +60,12 @@ def check(
     from trainer import curriculum
     from trainer.choice import choose_tissue
     from trainer.metrics.registry import check_targets
+    from trainer.scene import build
 
     def check_task(task: curriculum.Task) -> None:
         check_targets(task)
         choose_tissue(task, task.name)
+        build(task)
 
     problems = curriculum.check(path, check_task)
     if as_json:
