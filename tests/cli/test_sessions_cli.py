@@ -198,12 +198,26 @@ def test_view_opens_the_recording_for_this_machine_only(
     third = "20261122-030000-0002"
     write(path, third, recording=str(recording))
     called = []
+    monkeypatch.setenv("DISPLAY", ":0")
     monkeypatch.setattr(subprocess, "call", lambda command: called.append(command) or 3)
     assert runner.invoke(app, ["view", "last"]).exit_code == 3
     assert called == [[sys.executable, "-m", "rerun_cli", str(recording), "--bind", "127.0.0.1"]]
     recording.unlink()
     assert f"{recording}: the recording of session {third} is gone" in complaint("view", "last")
     assert "was made without a recording" in complaint("view", FIRST)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere a display needs no variable")
+def test_view_without_a_display_says_where_the_recording_is(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = tmp_path / "r.rrd"
+    recording.touch()
+    write(path, "20261122-030000-0002", recording=str(recording))
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr(subprocess, "call", lambda command: pytest.fail("the viewer was started"))
+    assert complaint("view", "last").startswith(f"{recording}: no display to show it on here")
 
 
 def test_unknown_sessions_and_logs_are_said_so(path: Path, tmp_path: Path) -> None:

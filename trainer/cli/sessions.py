@@ -139,6 +139,7 @@ def replay(
 @app.command()
 def view(session: SessionArgument, db: DbOption = None) -> None:
     """Open a session's recording in the rerun viewer."""
+    import os
     import subprocess
     import sys
 
@@ -153,6 +154,9 @@ def view(session: SessionArgument, db: DbOption = None) -> None:
         )
     if not Path(found.recording).is_file():
         raise LogError(f"{found.recording}: the recording of session {found.id} is gone; the log still has its events")
+    # The viewer itself ends without a display as if all were well.
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise LogError(f"{found.recording}: no display to show it on here; copy it to a machine that has one")
     # The viewer listens for more data; without --bind it would do so on every network.
     raise typer.Exit(subprocess.call([sys.executable, "-m", "rerun_cli", found.recording, "--bind", "127.0.0.1"]))
 
