@@ -80,7 +80,7 @@ def test_show(path: Path) -> None:
     assert document["event_list"][0]["axial_mm"] == pierce(0).axial_mm
     assert "event_list" not in answer("show", FIRST)
     shown = runner.invoke(app, ["show", "last", "--events"]).stdout
-    for text in (SECOND, "Bo", "1 pierce", "bite_mm", "0.3 mm", "nothing measured", "axial_mm 0.35", "seed 7"):
+    for text in (SECOND, "Bo", "1 pierce", "bite_mm", "0.30 mm", "nothing measured", "axial_mm 0.35", "seed 7"):
         assert text in shown
 
 

@@ -193,12 +193,12 @@ def print_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
 
 def print_metrics(metrics: Sequence[Metric]) -> None:
     """Scores as a table, with their target bands."""
-    from trainer.reporting.wording import band
+    from trainer.reporting.wording import band, number
 
     rows = [
         (
             m.name,
-            "nothing measured" if m.value is None else f"{m.value:.4g} {m.unit}",
+            "nothing measured" if m.value is None else f"{number(m.value, m.unit)} {m.unit}",
             band(m.target_low, m.target_high, m.unit),
             m.source,
         )
