@@ -7,9 +7,11 @@ import subprocess
 import sys
 from contextlib import closing
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
 from tests.log.log_samples import METRICS, contact, execute, header, pierce, step, task_done, write
@@ -56,6 +58,16 @@ def test_list(path: Path) -> None:
     for text in (FIRST, SECOND, "Ana", "Bo", "anastomosis/needle-drive", "completed"):
         assert text in shown
     assert "'Cy'; known: Ana, Bo" in complaint("list", "--trainee", "Cy")
+
+
+def test_a_narrow_screen_shows_all_of_a_session(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A table of seven columns would lose six of them."""
+    narrow = partial(Console, width=40)
+    monkeypatch.setattr("rich.console.Console", lambda width: narrow())
+    shown = runner.invoke(app, ["list", "--trainee", "Bo"]).stdout.splitlines()
+    assert max(map(len, shown)) <= 40
+    assert (shown[0], shown[2]) == (SECOND, "  trainee: Bo")
+    assert {"  task: anastomosis/needle-drive", "  outcome: completed", "  duration: 0.0 s"} <= set(shown)
 
 
 def test_list_closes_interrupted_sessions_and_says_so(path: Path) -> None:

@@ -161,6 +161,10 @@ def view(session: SessionArgument, db: DbOption = None) -> None:
     raise typer.Exit(subprocess.call([sys.executable, "-m", "rerun_cli", found.recording, "--bind", "127.0.0.1"]))
 
 
+#: Columns of a screen; with fewer a list of sessions has no room for its seven.
+NARROW = 80
+
+
 @contextmanager
 def opened(path: Path | None) -> Iterator[Database]:
     """The log that an option names; sessions that were interrupted are closed first, and told about on stderr."""
@@ -174,7 +178,10 @@ def opened(path: Path | None) -> Iterator[Database]:
 
 
 def print_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Rows under a head. The first column is never broken, and nothing is where nobody looks at a screen."""
+    """Rows under a head. The first column is never broken, and nothing is where nobody looks at a screen.
+
+    On a narrow screen, where a table would have no room for most of its columns, each row is a paragraph.
+    """
     import sys
 
     from rich import box
@@ -183,6 +190,12 @@ def print_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     from rich.text import Text
 
     console = Console(width=None if sys.stdout.isatty() else 1000)
+    if console.width < NARROW:
+        for first, *others in rows:
+            console.print(Text(first))
+            for title, cell in zip(head[1:], others, strict=True):
+                console.print(Text(f"  {title}: {cell}"))
+        return
     table = Table(box=box.SIMPLE_HEAD)
     for number, title in enumerate(head):
         table.add_column(title, no_wrap=number == 0)
