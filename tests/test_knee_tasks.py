@@ -230,7 +230,7 @@ def test_an_anatomy_without_the_structure_is_refused_in_one_line(built: Anatomy)
     with pytest.raises(ConfigError, match=message):
         scene.build(RELEASE, anatomy=without)
     labels = np.where(built.volume.labels == 9, 0, built.volume.labels).astype(np.uint8)
-    with pytest.raises(ConfigError, match="^task 'probe-landmarks': anatomy 'knee' has no medial meniscus where .*$"):
+    with pytest.raises(ConfigError, match=r"^task 'probe-landmarks': anatomy 'knee' has no medial meniscus where .*$"):
         scene.build(LANDMARKS, anatomy=replace(built, volume=replace(built.volume, labels=labels)))
 
 

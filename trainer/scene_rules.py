@@ -19,6 +19,8 @@ from trainer.interactions.world import World
 
 #: The steps whose ``place_mm`` is a mark on their structure, or where it is pulled to.
 MARKED = ("grasp", "pull", "cut")
+#: Kinds of structures that no instrument lies in.
+HARD = ("bone", "cartilage")
 #: A mark is at most so far from its structure, and a portal from the elements of the task. Assumed: half of what a knee
 #: is wide; what lies beyond is a slip of the pen or of the unit.
 FAR_MM = 50.0
@@ -63,7 +65,7 @@ def _vessels_apart(world: World) -> None:
 
 def _outside_of_bone(region: Region, place: Array, key: str) -> None:
     structure = region.structure_at(_in_layer(region, place))
-    if structure and structure not in region.tissue and structures()[structure].rigid:
+    if structure and structure not in region.tissue and structures()[structure].kind in HARD:
         raise ConfigError(f"{key} lies in the {structure}; expected a place outside of bone and cartilage")
 
 
