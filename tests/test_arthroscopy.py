@@ -150,6 +150,8 @@ WRONG = [
     (f'structure = "{PCL}"\nplace', 'structure = "femur"\nplace', "names no movable structure of the scene: 'femur'"),
     ("tack_at = 0.97", "tack_at = 0.6", "'tack_at' is for a grasper, and greater than 'close_at'"),
     ("stretch = { value = 1.5", "stretch = { value = 0.5", "stretch' must be >= 1"),
+    ("tack_at = 0.97", "", "step 'tack it there' needs a grasper with 'tack_at'"),
+    ('kind = "scissors"', 'kind = "grasper"', "step 'cut it through between tack and femur' needs an instrument of"),
     ('kind = "scissors"', 'kind = "saw"', "must be one of 'forceps', 'grasper', 'scissors', 'probe', found 'saw'"),
 ]  # fmt: skip
 

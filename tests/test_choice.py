@@ -67,6 +67,18 @@ def test_the_cheapest_within_the_budget_is_taken(report: Path) -> None:
     assert chosen(report, KEPT, budget=0.001).tolerance_mN == 2e-5
 
 
+def test_vessels_that_no_tick_can_hold_are_told(report: Path) -> None:
+    """2 ms for 1000 nodes: 4 ms for the stitch's 2016, 202 ms for 100800, and a tick at 100 Hz has 10 ms."""
+    found = chosen(report, KEPT)
+    assert choice.overfull(STITCH, found) == choice.overfull(STITCH, None) == ""
+    fine = tuple(replace(v, layers=300, around=84) for v in STITCH.scene.vessel)
+    told = choice.overfull(replace(STITCH, scene=replace(STITCH.scene, vessel=fine)), found)
+    assert told.startswith(
+        "the vessels have 100800 nodes: a tick is expected to take 202 ms or more, the task gives it 10"
+    )
+    assert choice.overfull(replace(STITCH, tick_hz=500.0), found).endswith("less 'layers' or 'around' are faster")
+
+
 def test_a_force_that_is_left_over_counts_too(report: Path) -> None:
     """A budget of 0.2 mN lets the first setting pass, just; less of it does not, wherever the nodes may be."""
     near = [row("kept factor", "to 0.01 (0.2 mN)", 1.0, 1e-6), *KEPT[1:]]

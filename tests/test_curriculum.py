@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from trainer import curriculum
+from trainer import curriculum, interactions
 from trainer.config import ConfigError
 from trainer.data_files import data_folder
 from trainer.metrics.registry import check_targets
@@ -95,6 +96,16 @@ WRONG: list[tuple[str, str, str]] = [
     ("node_error_mm", "node_error_um", r"\[solver\]: unknown key 'node_error_um', did you mean 'node_error_mm'"),
     ("axis = [-1.0, 0.0, 0.0]", "axis = [-1e-200, 0.0, 0.0]", r"'axis' must not be the zero vector"),
     ('kind = "forceps"', 'kind = "forceps"\nopen_at = 0.8', r"'open_at' must be less than 'close_at'"),
+    ("tissue_pull =", "tissue_love =", r"unknown limit 'limits\.tissue_love', did you mean 'tissue_pull'\?"),
+    ("tissue_pull =", "x =", r"unknown limit 'limits\.x'; known: tissue_pull, grasp_pressure, probe_force"),
+    ('unit = "kPa"', 'unit = "psi"', r"'limits\.grasp_pressure\.unit' must be 'kPa', found 'psi'"),
+    ('unit = "mN"', 'unit = "kPa"', r"'limits\.tissue_pull\.unit' must be 'mN', found 'kPa'"),
+    ("link_mm = 0.2", "link_mm = 200.0", r"\[scene\.thread\]: 'link_mm' must be at most 'length_mm'"),
+    ("low = 70.0", "low = 91.0", r"\[metric\[0\]\]: 'low' must be at most 'high', found 91 and 90"),
+    ('"entry_angle_deg"', '"bite_ratio"', r"two entries of 'metric' are of 'bite_ratio'"),
+    ("length_mm = 3.8", "length_mm = 38.0", r"'needle\.length_mm' must be more than .* at most 10 of its outer"),
+    ("length_mm = 3.8", "length_mm = 0.1", r"must be more than the wall of vessel 'A', 0\.15 mm, .* found 0\.1"),
+    ("wire_mm = 0.07", "wire_mm = 0.7", r"wire_mm' must be less than the lumen of vessel 'A', 0\.7 mm, found 0\.7"),
 ]
 
 
@@ -103,6 +114,13 @@ def test_a_wrong_task_is_refused_in_one_line(old: str, new: str, message: str) -
     with pytest.raises(ConfigError, match=rf"^t\.toml: .*{message}") as caught:
         curriculum.parse_task(changed(old, new), "t.toml")
     assert "\n" not in str(caught.value)
+
+
+def test_a_task_can_limit_what_the_rules_ask_about() -> None:
+    """A limit that no rule asks about would be kept and never exceeded."""
+    rules = Path(interactions.__path__[0]).glob("*.py")
+    asked = {name for rule in rules for name in re.findall(r'check_limit\(world, "(\w+)"', rule.read_text())}
+    assert asked == set(curriculum.LIMITS)
 
 
 def test_a_thread_needs_a_needle() -> None:

@@ -230,10 +230,11 @@ def test_a_ligament_is_grown_to_bone_near_its_ends_alone(built: Anatomy) -> None
 def test_an_anatomy_without_the_structure_is_refused_in_one_line(built: Anatomy) -> None:
     labels = np.where(built.volume.labels == 12, 0, built.volume.labels).astype(np.uint8)
     without = replace(built, volume=replace(built.volume, labels=labels))
-    with pytest.raises(ConfigError, match=rf"^anatomy 'knee' has no {PCL}, around which the task's scene lies$"):
+    message = f"^task 'ligament-release': anatomy 'knee' has no {PCL}, around which the task's scene lies$"
+    with pytest.raises(ConfigError, match=message):
         scene.build(RELEASE, anatomy=without)
     labels = np.where(built.volume.labels == 9, 0, built.volume.labels).astype(np.uint8)
-    with pytest.raises(ConfigError, match=r"^anatomy 'knee' has no medial meniscus where the task takes place$"):
+    with pytest.raises(ConfigError, match=r"^task 'probe-landmarks': anatomy 'knee' has no medial meniscus where .*$"):
         scene.build(LANDMARKS, anatomy=replace(built, volume=replace(built.volume, labels=labels)))
 
 

@@ -77,6 +77,24 @@ def choose_tissue(task: Task, name: str, report: Path | None = None) -> Choice |
     return min(choices, key=lambda choice: choice.tolerance_mN)
 
 
+def overfull(task: Task, choice: Choice | None) -> str:
+    """One line where a tick of the task cannot hold its vessels, "" where it can.
+
+    The measured time of a frame is carried over in proportion to the nodes of all vessels, which are solved together: a
+    lower bound, since a direct solver's work grows faster, and a tick may be taken in several movements.
+    """
+    if choice is None:
+        return ""
+    nodes = sum(2 * v.layers * v.around for v in task.scene.vessel)
+    expected_ms, tick_ms = choice.measured_ms * nodes / choice.nodes, 1000.0 / task.tick_hz
+    if expected_ms <= tick_ms:
+        return ""
+    return (
+        f"the vessels have {nodes} nodes: a tick is expected to take {expected_ms:.0f} ms or more, the task gives it "
+        f"{tick_ms:g} ms ({choice.source}); getting ready may take minutes, and less 'layers' or 'around' are faster"
+    )
+
+
 def thread_method(thread: ThreadSpec | None) -> dict[str, Any] | None:
     """What moves a scene's thread, in words and numbers; None where no thread is."""
     if thread is None:

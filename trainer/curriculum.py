@@ -6,6 +6,7 @@ against which target. A component that is not named is ``None`` and costs nothin
 
 from __future__ import annotations
 
+import difflib
 import hashlib
 import math
 from collections.abc import Callable
@@ -22,6 +23,9 @@ Vector = tuple[float, float, float]
 FORCE_MN = {"bounds": Bounds(0.0, 1e6, low_open=True)}
 DRAG_MN = {"bounds": Bounds(0.0, 1e6)}
 SUTURES = "sutures.toml"
+#: A needle is at most so many outer diameters of a vessel long, along its arc. Assumed: it is four in our tasks, and
+#: one of ten could hardly turn in the lumen; more is a slip of the pen or of the unit.
+NEEDLE_DIAMETERS = 10.0
 MOST_LINKS = 10_000  # assumed: a hundred times those of a stitch
 MOST_ELEMENTS = 10**7  # of a block of a knee: more has mixed up a unit
 
@@ -100,6 +104,8 @@ class ThreadSpec:
     def __post_init__(self) -> None:
         if self.length_mm > MOST_LINKS * self.link_mm:
             raise ValueError(f"'length_mm' must be at most {MOST_LINKS} times 'link_mm'")
+        if self.link_mm > self.length_mm:
+            raise ValueError("'link_mm' must be at most 'length_mm': a thread has one link or more")
 
 
 @dataclass(frozen=True)
@@ -200,6 +206,24 @@ class SceneSpec:
             raise ValueError("a 'thread' needs a 'needle' at its head")
         if self.needle is not None and self.needle.held_by not in {"", *(i.tool for i in self.instrument)}:
             raise ValueError(f"'needle.held_by' names no instrument: {self.needle.held_by!r}")
+        if self.needle is not None:
+            for v in self.vessel:
+                _check_needle(self.needle, v)
+
+
+def _check_needle(needle: NeedleSpec, vessel: VesselSpec) -> None:
+    """Raises ValueError for a needle that cannot go through the wall of a vessel and turn in its lumen."""
+    lumen, most = vessel.outer_diameter_mm - 2.0 * vessel.wall_mm, NEEDLE_DIAMETERS * vessel.outer_diameter_mm
+    if needle.wire_mm >= lumen:
+        raise ValueError(
+            f"'needle.wire_mm' must be less than the lumen of vessel '{vessel.name}', {lumen:g} mm, "
+            f"found {needle.wire_mm:g}"
+        )
+    if not vessel.wall_mm < needle.length_mm <= most:
+        raise ValueError(
+            f"'needle.length_mm' must be more than the wall of vessel '{vessel.name}', {vessel.wall_mm:g} mm, and at "
+            f"most {NEEDLE_DIAMETERS:g} of its outer diameters, {most:g} mm, found {needle.length_mm:g}"
+        )
 
 
 @dataclass(frozen=True)
@@ -248,6 +272,10 @@ class Step:
 TISSUE_STEPS = ("grasp", "pull", "tack", "cut", "retract")
 #: Those for which a structure is to be cut through, between what it is grown to.
 SEVERING_STEPS = ("cut", "retract")
+#: The instrument that such a step is done with.
+DONE_WITH = {"grasp": "grasper", "pull": "grasper", "tack": "grasper", "cut": "scissors"}
+#: What a task can limit, and the unit of its value: the rules of interaction ask about these and about no others.
+LIMITS = {"tissue_pull": "mN", "grasp_pressure": "kPa", "probe_force": "mN"}
 
 
 @dataclass(frozen=True)
@@ -267,6 +295,10 @@ class MetricTarget:
     source: str
     low: float | None = None
     high: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.low is not None and self.high is not None and self.low > self.high:
+            raise ValueError(f"'low' must be at most 'high', found {self.low:g} and {self.high:g}")
 
 
 @dataclass(frozen=True)
@@ -304,6 +336,29 @@ class Task:
                 raise ValueError(f"step '{s.name}' needs an 'anatomy' and an instrument of kind 'probe'")
         if not self.step:
             raise ValueError("a task needs at least one 'step'")
+        names = [m.name for m in self.metric]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"two entries of 'metric' are of '{name}'")
+        self._check_limits()
+        self._check_instruments()
+
+    def _check_limits(self) -> None:
+        for name, limit in self.limits.items():
+            if name not in LIMITS:
+                near = difflib.get_close_matches(name, LIMITS, n=1, cutoff=0.5)
+                hint = f", did you mean '{near[0]}'?" if near else f"; known: {', '.join(LIMITS)}"
+                raise ValueError(f"unknown limit 'limits.{name}'{hint}")
+            if limit.unit != LIMITS[name]:
+                raise ValueError(f"'limits.{name}.unit' must be '{LIMITS[name]}', found '{limit.unit}'")
+
+    def _check_instruments(self) -> None:
+        for s in self.step:
+            able = [i for i in self.scene.instrument if i.kind == DONE_WITH.get(s.kind)]
+            if s.kind in DONE_WITH and not able:
+                raise ValueError(f"step '{s.name}' needs an instrument of kind '{DONE_WITH[s.kind]}'")
+            if s.kind == "tack" and all(i.tack_at is None for i in able):
+                raise ValueError(f"step '{s.name}' needs a grasper with 'tack_at', the closure at which it tacks")
 
 
 @dataclass(frozen=True)

@@ -42,9 +42,14 @@ def resimulate(record: SessionRecord, rows: Iterable[int] | None = None) -> list
 
 def _knee(header: SessionHeader, task: Task) -> Anatomy | None:
     """The knee that the session was practised in; None where its task has none. Raises ConfigError."""
-    reference = header.versions.get(ANATOMY, "")
-    found = library.of_task(task.scene.anatomy, reference)
-    if found is not None and header.versions.get(ANATOMY_SHA256) != library.fingerprint(found):
+    reference, sha256 = header.versions.get(ANATOMY, ""), header.versions.get(ANATOMY_SHA256, "")
+    try:
+        found = library.of_task(task.scene.anatomy, reference)
+    except ConfigError as error:
+        raise ConfigError(
+            f"session {header.id} was practised in the knee '{reference}' (SHA-256 {sha256[:16]}…): {error}"
+        ) from None
+    if found is not None and sha256 != library.fingerprint(found):
         raise ConfigError(f"the knee '{reference}' has changed since session {header.id} was practised in it")
     return found
 

@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from trainer import showing
+from trainer import scene_rules, showing
 from trainer.anatomy import vessel as vessels
 from trainer.anatomy.imported import Anatomy
+from trainer.config import ConfigError
 from trainer.curriculum import Task
 from trainer.events import Aborted, Event, StepDone, TaskDone, TaskStarted, TrackingBack, TrackingLost
 from trainer.geometry import Array, Rigid, quaternion_from_axes, quaternion_from_euler_deg, slerp, unit
@@ -53,7 +54,8 @@ def build(task: Task, tolerance_mN: float = holding.TOLERANCE_MN, anatomy: Anato
     """The scene at rest, with the instruments at home and the needle where the task has it held.
 
     ``tolerance_mN`` is the unbalanced force at which the tissue counts as in equilibrium; ``anatomy`` the knee to
-    practise on, where that is not the task's own. Raises ConfigError for an anatomy that the task cannot use.
+    practise on, where that is not the task's own. Raises ConfigError for an anatomy that the task cannot use, and for
+    things that lie where it cannot be practised.
     """
     spec = task.scene
     world_from_scene = Rigid(np.array(spec.position_mm), quaternion_from_euler_deg(spec.rotation_deg))
@@ -91,8 +93,12 @@ def build(task: Task, tolerance_mN: float = holding.TOLERANCE_MN, anatomy: Anato
         world.nodes = thread_pull.swage(world) + along[:, None] * back
         if spec.thread.drapes:
             drape.begin(world)
-    if spec.anatomy is not None:
-        world.region = region.build(task, spec.anatomy, anatomy)
+    try:
+        if spec.anatomy is not None:
+            world.region = region.build(task, spec.anatomy, anatomy)
+        scene_rules.check(world)
+    except ConfigError as error:
+        raise ConfigError(f"task '{task.name}': {error}") from None
     return Scene(world, tolerance_mN)
 
 

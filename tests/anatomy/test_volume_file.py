@@ -190,7 +190,7 @@ BAD = {
     "no space": "'space' must be left-posterior-superior, .*which way the patient lies is not known",
     "4-d": r"4 dimensions \(5 × 4 × 3 × 2\); expected one volume of three",
     "truncated": "cut short or damaged",
-    "nothing": "cut short or damaged",
+    "nothing": "an empty file; copy it again",
     "nifti truncated": "cut short or damaged",
     "nifti 4-d": "4 dimensions",
     "nifti without code": "neither 'sform_code' nor 'qform_code' is set",
@@ -226,3 +226,20 @@ def test_a_file_cut_anywhere_is_one_line(name: str, tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match="a") as caught:
             read(path)
         assert str(tmp_path) in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", ["nhdr", "mhd"])
+def test_elements_that_are_apart_and_not_there_are_named(kind: str, tmp_path: Path) -> None:
+    """Such a header is not damaged, and copying it again would not help."""
+    path = tmp_path / f"scan.{kind}"
+    if kind == "mhd":
+        write_mha(path, VALUES, oblique())
+    else:
+        write_nrrd(path, VALUES, oblique())
+        header, _, data = path.read_bytes().partition(b"\n\n")
+        path.write_bytes(header + b"\ndata file: scan.raw\n\n")
+        (tmp_path / "scan.raw").write_bytes(data)
+    np.testing.assert_array_equal(read(path).values, VALUES)
+    (tmp_path / "scan.raw").unlink()
+    with pytest.raises(ConfigError, match=r"scan\.raw: no such file, where a header says that its elements are"):
+        read(path)

@@ -92,6 +92,21 @@ def test_what_is_wrong_is_one_line_and_exit_code_1(scan: Path, tmp_path: Path, c
     assert not (tmp_path / "x").exists()
 
 
+@pytest.mark.parametrize("factor", [1e-3, 1e3], ids=["m for mm", "µm for mm"])
+def test_a_scan_of_no_knees_size_is_refused(
+    factor: float, volume: LabelVolume, tmp_path: Path, command_line: CommandLine
+) -> None:
+    """A factor of a thousand, at voxels of up to a metre, that the file's reader has to take as they are."""
+    path = tmp_path / "scan.nrrd"
+    spacing = tuple(factor / 1.5 * h for h in volume.spacing_mm)
+    write_nrrd(LabelVolume(volume.labels, (spacing[0], spacing[1], spacing[2]), volume.lps_from_volume), path)
+    for command in (("import", path, "--labels", TRAINER_LABELS, "--out", tmp_path / "x"), ("inspect", path)):
+        code, _, err = command_line("anatomy", *command)
+        assert code == 1
+        assert "is not the size of a knee's scan, 20 to 1000 mm along each axis: is its spacing in mm?" in err
+    assert not (tmp_path / "x").exists()
+
+
 def test_an_empty_volume_is_told(volume: LabelVolume, tmp_path: Path, command_line: CommandLine) -> None:
     path = tmp_path / "empty.nrrd"
     write_nrrd(LabelVolume(np.zeros_like(volume.labels), volume.spacing_mm, volume.lps_from_volume), path)

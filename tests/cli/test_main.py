@@ -83,7 +83,6 @@ ERRORS = [
     ),
     (PermissionError(13, "Permission denied", "/locked/x"), "trainer: /locked/x: Permission denied\n"),
     (OSError(28, "No space left on device"), "trainer: No space left on device\n"),
-    (KeyboardInterrupt(), "trainer: interrupted\n"),
 ]
 
 
@@ -100,6 +99,13 @@ def test_an_error_is_one_line_and_exit_code_1(
 ) -> None:
     raising(error, monkeypatch)
     assert command_line("curricula", "check", "x") == (1, "", line)
+
+
+def test_ctrl_c_is_one_line_and_the_shells_exit_code(
+    command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    raising(KeyboardInterrupt(), monkeypatch)
+    assert command_line("curricula", "check", "x") == (130, "", "trainer: interrupted\n")
 
 
 def test_a_fault_of_the_program_is_not_hidden(command_line: CommandLine, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -198,7 +198,7 @@ REFUSED = [
     (["metric.toml"], "no metric 'entry_angle_rad', did you mean 'entry_angle_deg'?"),
     (["anastomosis/single-stitch", "--db", "folder"], "folder: "),
     (["anastomosis/single-stitch", "--db", "text.db"], "text.db: not a log"),
-    (["anastomosis/single-stitch", "--record", "text.db/x.rrd"], "text.db: File exists"),
+    (["anastomosis/single-stitch", "--record", "text.db/x.rrd"], "text.db is a file, not a folder"),
     (["anastomosis/single-stitch", "--trainee", " "], "a trainee's name must not be empty"),
     (["anastomosis/single-stitch", "--trainee", "x" * 101], "has at most 100 characters, found 101"),
     (["anastomosis/single-stitch", "--trainee", "A\nB"], "must be plain text in one line, found '\\n' in it"),

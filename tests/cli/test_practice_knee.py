@@ -53,6 +53,7 @@ def test_a_session_in_another_knee_is_replayed_in_it(
     assert found["events"]["portal_enter"] == 1
     replay = ("sessions", "replay", "last", "--verify", "--db", db)
     assert command_line(*replay)[0] == 0
+    before = library.fingerprint(imported.load(folder))
     kept = imported.load(folder).volume
     labels = kept.labels.copy()
     labels[0, 0, 0] = 5
@@ -68,6 +69,12 @@ def test_a_session_in_another_knee_is_replayed_in_it(
     code, _, err = command_line(*replay)
     assert code == 1
     assert "has no anatomy.json" in err.strip().splitlines()[-1]
+    (folder / imported.LABELS).unlink()
+    folder.rmdir()
+    code, _, err = command_line(*replay)
+    assert code == 1
+    wanted = f"session {found['session']} was practised in the knee '{folder}' (SHA-256 {before[:16]}…): no knee "
+    assert wanted in err.strip().splitlines()[-1]
 
 
 def test_the_tasks_own_knee_is_stored_by_its_name(command_line: CommandLine, task: Path, tmp_path: Path) -> None:
@@ -104,6 +111,7 @@ def test_a_task_with_vessels_as_well_takes_place_in_the_named_knee_too(
     ("reference", "anatomy", "message"),
     [
         ("arthroscopy/probe-landmarks", "nowhere", "no knee 'nowhere': expected knee, or a folder that"),
+        ("arthroscopy/probe-landmarks", "scan.nrrd", "import it first: trainer anatomy import scan.nrrd --labels"),
         ("arthroscopy/probe-landmarks", ".", "no imported anatomy: it has no anatomy.json"),
         ("arthroscopy/ligament-2d", "knee", "this task takes place in no knee that could be another one"),
         ("anastomosis/needle-drive", "knee", "this task takes place in no knee that could be another one"),
@@ -118,6 +126,7 @@ def test_a_knee_that_cannot_be_had_is_told_in_one_line(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "scan.nrrd").write_bytes(b"NRRD0004\n")
     db = tmp_path / "log.db"
     code, out, err = practised(command_line, db, reference, "--anatomy", anatomy)
     assert (code, out) == (1, "")

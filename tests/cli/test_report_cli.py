@@ -74,6 +74,23 @@ def test_a_full_disk_is_told_with_the_name_of_the_file(log: Path) -> None:
     assert (result.exception.errno, result.exception.filename) == (errno.ENOSPC, str(FULL))
 
 
+def test_a_page_that_cannot_be_written_leaves_the_one_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A disk that fills up half-way: neither an empty page nor a part of one, and the error names the page."""
+
+    def half(path: Path, text: str, encoding: str) -> int:
+        with path.open("w", encoding=encoding) as file:
+            file.write(text[: len(text) // 2])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    page = tmp_path / "page.html"
+    report.write_page(page, "before")
+    monkeypatch.setattr(Path, "write_text", half)
+    with pytest.raises(OSError, match="No space left") as failed:
+        report.write_page(page, "after")
+    assert failed.value.filename == str(page)
+    assert {p.name: p.read_text() for p in tmp_path.iterdir()} == {"page.html": "before"}
+
+
 def test_progress_is_that_of_one_trainee(log: Path, tmp_path: Path) -> None:
     page = tmp_path / "progress.html"
     arguments = ["progress", "--trainee", "Ada", "--db", str(log), "--json", "--html", str(page)]

@@ -7,9 +7,11 @@ import subprocess
 import sys
 from contextlib import closing
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
 from tests.log.log_samples import METRICS, contact, execute, header, pierce, step, task_done, write
@@ -72,6 +74,16 @@ def test_list(path: Path) -> None:
     assert "'Cy'; known: Ana, Bo" in complaint("list", "--trainee", "Cy")
 
 
+def test_a_narrow_screen_shows_all_of_a_session(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A table of seven columns would lose six of them."""
+    narrow = partial(Console, width=40)
+    monkeypatch.setattr("rich.console.Console", lambda width: narrow())
+    shown = runner.invoke(app, ["list", "--trainee", "Bo"]).stdout.splitlines()
+    assert max(map(len, shown)) <= 40
+    assert (shown[0], shown[2]) == (SECOND, "  trainee: Bo")
+    assert {"  task: anastomosis/needle-drive", "  outcome: completed", "  duration: 0.0 s"} <= set(shown)
+
+
 def test_list_closes_interrupted_sessions_and_says_so(path: Path) -> None:
     with closing(LogSink(path, header("20261122-030000-0002"))) as sink:
         sink.tick(step(0, contact(0)))
@@ -94,7 +106,7 @@ def test_show(path: Path) -> None:
     assert document["event_list"][0]["axial_mm"] == pierce(0).axial_mm
     assert "event_list" not in answer("show", FIRST)
     shown = runner.invoke(app, ["show", "last", "--events"]).stdout
-    for text in (SECOND, "Bo", "1 pierce", "bite_mm", "0.3 mm", "nothing measured", "axial_mm 0.35", "seed 7"):
+    for text in (SECOND, "Bo", "1 pierce", "bite_mm", "0.30 mm", "nothing measured", "axial_mm 0.35", "seed 7"):
         assert text in shown
 
 
@@ -212,12 +224,26 @@ def test_view_opens_the_recording_for_this_machine_only(
     third = "20261122-030000-0002"
     write(path, third, recording=str(recording))
     called = []
+    monkeypatch.setenv("DISPLAY", ":0")
     monkeypatch.setattr(subprocess, "call", lambda command: called.append(command) or 3)
     assert runner.invoke(app, ["view", "last"]).exit_code == 3
     assert called == [[sys.executable, "-m", "rerun_cli", str(recording), "--bind", "127.0.0.1"]]
     recording.unlink()
     assert f"{recording}: the recording of session {third} is gone" in complaint("view", "last")
     assert "was made without a recording" in complaint("view", FIRST)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere a display needs no variable")
+def test_view_without_a_display_says_where_the_recording_is(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = tmp_path / "r.rrd"
+    recording.touch()
+    write(path, "20261122-030000-0002", recording=str(recording))
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr(subprocess, "call", lambda command: pytest.fail("the viewer was started"))
+    assert complaint("view", "last").startswith(f"{recording}: no display to show it on here")
 
 
 def test_unknown_sessions_and_logs_are_said_so(path: Path, tmp_path: Path) -> None:

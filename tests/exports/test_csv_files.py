@@ -50,6 +50,13 @@ def test_everything_reads_back_exactly(tmp_path: Path) -> None:
     assert float(poses[2]["time_s"]) == 0.01
 
 
+@pytest.mark.parametrize("name", ["=cmd|' /C calc'!A0", "+1", "-Ana", "@Ana"])
+def test_no_name_is_a_formula(name: str, tmp_path: Path) -> None:
+    """Numbers stay numbers, negative ones too: reading back exactly is tested above."""
+    write([performed(seed=5, trainee=name)], tmp_path / "out")
+    assert rows(tmp_path / "out" / "sessions.csv")[0]["trainee"] == f"'{name}"
+
+
 def test_unseen_tools_are_marked(tmp_path: Path) -> None:
     valid = np.array([[True, False], [True, True]])
     write([record(valid=valid)], tmp_path / "out")

@@ -83,7 +83,7 @@ def test_a_cut_of_one_structure_says_nothing_of_another() -> None:
 
 
 def test_a_structure_that_joins_nothing_cannot_be_asked_to_be_cut() -> None:
-    wrong = f"^anatomy 'two bridges': the {ACL} does not join femur and tibia, so that it cannot be cut through$"
+    wrong = f"anatomy 'two bridges': the {ACL} does not join femur and tibia, so that it cannot be cut through$"
     with pytest.raises(ConfigError, match=wrong):
         scene.build(task_with(ACL, PCL, ACL), anatomy=two_bridges(to_tibia=False))
 

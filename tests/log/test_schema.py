@@ -182,8 +182,25 @@ def test_an_older_log_says_how_to_migrate_and_migrates(path: Path, monkeypatch: 
 def test_a_newer_log_is_refused(path: Path) -> None:
     execute(path, "insert into _sqlite_migrations values (99, 'trainer', 'm999', '3000-01-01')")
     for opening in (open_log, create_log, migrate):
-        with pytest.raises(LogError, match="newer version"):
+        with pytest.raises(LogError, match="newer version") as refused:
             opening(path)
+        assert "pip" not in str(refused.value)  # the registry's package of this name is somebody else's
+
+
+@pytest.mark.parametrize("write_ahead", [False, True], ids=["of no bytes", "without a table"])
+def test_a_log_that_was_only_begun_holds_no_sessions(tmp_path: Path, write_ahead: bool) -> None:
+    """Ctrl-C in the first moment leaves such a file; the next practice makes the log of it."""
+    path = tmp_path / "s.db"
+    path.touch()
+    if write_ahead:
+        execute(path, "pragma journal_mode = wal")
+        assert path.stat().st_size > 0
+    for opening in (open_log, migrate):
+        with pytest.raises(LogError, match=r"s\.db: holds no sessions yet; `trainer practice` logs the first"):
+            opening(path)
+    create_log(path).close()
+    with open_log(path) as db:
+        assert reader.list_sessions(db) == []
 
 
 def test_a_log_whose_columns_lost_their_names_is_damaged(path: Path) -> None:

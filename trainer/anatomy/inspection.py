@@ -15,6 +15,10 @@ from trainer.anatomy.volume_file import FileVolume
 from trainer.config import ConfigError
 from trainer.geometry import Array
 
+#: A scan of a knee is at least and at most so long along each axis: a part of the joint, and a leg. Assumed; what lies
+#: beyond has mixed up mm with µm or m.
+LEAST_MM, MOST_MM = 20.0, 1000.0
+
 
 @dataclass(frozen=True)
 class Region:
@@ -41,11 +45,24 @@ def regions(file: FileVolume) -> dict[int, Region]:
 
 
 def check(file: FileVolume, found: Mapping[int, Region], given: LabelMap) -> None:
-    """Raises ConfigError when the map does not fit the file's labels, or its structures lie as in no knee."""
+    """Raises ConfigError when no knee is of the file's size, the map does not fit its labels, or its structures lie as
+    in no knee."""
+    check_size(file)
     if not found:
         raise ConfigError(f"{file.path}: holds no label: all elements are 0")
     label_map.check_against(given, set(found), file.path)
     landmarks.check(_by_name(found, given), given.side, file.path)
+
+
+def check_size(file: FileVolume) -> None:
+    """Raises ConfigError for a volume that is smaller or larger than a scan of a knee along one of its axes."""
+    size = np.array(file.values.shape) * file.spacing_mm
+    if size.min() < LEAST_MM or size.max() > MOST_MM:
+        sides = " × ".join(f"{mm:.4g}" for mm in size)
+        raise ConfigError(
+            f"{file.path}: {sides} mm is not the size of a knee's scan, {LEAST_MM:g} to {MOST_MM:g} mm along each "
+            "axis: is its spacing in mm?"
+        )
 
 
 def recognised(file: FileVolume, found: Mapping[int, Region]) -> LabelMap | None:
@@ -74,6 +91,10 @@ def describe(file: FileVolume, given: LabelMap | None) -> dict[str, Any]:
     recognised_map = given is None
     if given is None:
         given = recognised(file, found)
+        try:
+            check_size(file)
+        except ConfigError as error:
+            problems.append(str(error))
         if given is None:
             problems.append(f"{file.path}: no shipped label map fits; say with --labels which label is which structure")
     else:

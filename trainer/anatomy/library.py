@@ -17,6 +17,10 @@ def load(reference: str, voxel_mm: float = knee.USUAL_MM) -> Anatomy:
         spec = knee.load(reference)
         return Anatomy(reference, knee.build(spec, voxel_mm), spec.side, reference)
     folder = Path(reference)
+    if folder.is_file():
+        raise ConfigError(
+            f"{folder}: a file, not a knee; import it first: trainer anatomy import {folder} --labels TOML --out DIR"
+        )
     if not folder.is_dir():
         raise ConfigError(
             f"no knee '{reference}': expected {', '.join(knee.names())}, or a folder that `anatomy import` made"

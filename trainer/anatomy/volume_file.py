@@ -105,7 +105,8 @@ def _nrrd(file: Path) -> tuple[np.ndarray, Array, Path]:
     origin = np.asarray(header.get("space origin", np.zeros(3)), dtype=np.float64)
     if directions.shape != (3, 3) or origin.shape != (3,):
         raise ConfigError(f"{file}: 'space directions' and 'space origin' must have three numbers for each axis")
-    return values, _affine(directions.T, origin, NRRD_SPACES[space]), Path(header.get("data file", file))
+    elements = file.parent / str(header.get("data file", file.name))
+    return values, _affine(directions.T, origin, NRRD_SPACES[space]), elements
 
 
 def _nifti(file: Path) -> tuple[np.ndarray, Array, Path]:
@@ -228,6 +229,10 @@ def _labels(values: np.ndarray, file: Path) -> np.ndarray:
 
 
 def _unreadable(file: Path, error: Exception) -> ConfigError:
+    if isinstance(error, FileNotFoundError):  # of the elements: the header is there
+        return ConfigError(f"{error.filename or file}: no such file, where a header says that its elements are")
+    if file.stat().st_size == 0:
+        return ConfigError(f"{file}: an empty file; copy it again")
     reason = " ".join(str(error).split())[:160] or type(error).__name__
     return ConfigError(f"{file}: cut short or damaged ({reason}); copy the file again")
 

@@ -58,12 +58,15 @@ def check(
 ) -> None:
     """Check files of a curriculum; exit code 1 when something is wrong."""
     from trainer import curriculum
-    from trainer.choice import choose_tissue
+    from trainer.choice import choose_tissue, overfull
     from trainer.metrics.registry import check_targets
+    from trainer.scene import build
 
     def check_task(task: curriculum.Task) -> None:
         check_targets(task)
-        choose_tissue(task, task.name)
+        if slow := overfull(task, choose_tissue(task, task.name)):
+            typer.echo(f"task '{task.name}': {slow}", err=True)
+        build(task)
 
     problems = curriculum.check(path, check_task)
     if as_json:

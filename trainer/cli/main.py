@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import typer
 
-#: The exit code that typer makes of Ctrl-C.
+#: The exit code of Ctrl-C, the shell's and typer's.
 INTERRUPTED = 130
 
 
 def main() -> None:
-    """Run the command line; exit code 0 done, 1 failed with a line on stderr, 2 wrong usage."""
+    """Run the command line; exit code 0 done, 1 failed with a line on stderr, 2 wrong usage, 130 Ctrl-C."""
     _open_closed_streams()
     try:
         try:
@@ -31,7 +31,8 @@ def main() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
     except KeyboardInterrupt:
-        sys.exit("trainer: interrupted")
+        print("trainer: interrupted", file=sys.stderr)
+        sys.exit(INTERRUPTED)
     except Exception as error:
         if os.environ.get("TRAINER_DEBUG") or not _meant_for_people(error):
             raise

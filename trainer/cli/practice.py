@@ -139,7 +139,7 @@ def perform(
 def _open(stack: ExitStack, asked: Asked, clock: Fast) -> _Session:
     """Everything that a session needs, in the order in which it can be refused: the log comes last."""
     from trainer.anatomy import library
-    from trainer.choice import choose_tissue
+    from trainer.choice import choose_tissue, overfull
     from trainer.cli.warmup import announce, warm_up
     from trainer.clock import Realtime
     from trainer.drivers import open_driver
@@ -154,6 +154,8 @@ def _open(stack: ExitStack, asked: Asked, clock: Fast) -> _Session:
     task = asked.task_file.task
     check_targets(task)
     tissue = choose_tissue(task, asked.task_file.path)
+    if slow := overfull(task, tissue):
+        typer.echo(f"{asked.task_file.path}: {slow}", err=True)
     knee = library.of_task(task.scene.anatomy, asked.anatomy)
     if asked.recording_path is not None:
         _make_room(asked.recording_path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -73,10 +74,18 @@ def progress(
 
 
 def write_page(path: Path, page: str) -> None:
-    """Write a page and tell where it is, on stderr. Raises OSError."""
+    """Write a page and tell where it is, on stderr; where that fails, what was there before stays. Raises OSError."""
+    target = path.resolve()
+    whole = target.is_file() or not target.exists()  # a pipe or a device has nothing to lose, and no other name
+    part = target.with_name(f"{target.name}.part") if whole else target
     try:
-        path.write_text(page, encoding="utf-8")
+        part.write_text(page, encoding="utf-8")
+        if whole:
+            part.replace(target)
     except OSError as error:
+        if whole:
+            with suppress(OSError):
+                part.unlink()
         error.filename = str(path)  # a full disk names no file
         raise
     typer.echo(f"wrote {path}", err=True)

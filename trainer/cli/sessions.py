@@ -143,6 +143,7 @@ def replay(
 @app.command()
 def view(session: SessionArgument, db: DbOption = None) -> None:
     """Open a session's recording in the rerun viewer."""
+    import os
     import subprocess
     import sys
 
@@ -157,8 +158,15 @@ def view(session: SessionArgument, db: DbOption = None) -> None:
         )
     if not Path(found.recording).is_file():
         raise LogError(f"{found.recording}: the recording of session {found.id} is gone; the log still has its events")
+    # The viewer itself ends without a display as if all were well.
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise LogError(f"{found.recording}: no display to show it on here; copy it to a machine that has one")
     # The viewer listens for more data; without --bind it would do so on every network.
     raise typer.Exit(subprocess.call([sys.executable, "-m", "rerun_cli", found.recording, "--bind", "127.0.0.1"]))
+
+
+#: Columns of a screen; with fewer a list of sessions has no room for its seven.
+NARROW = 80
 
 
 @contextmanager
@@ -174,7 +182,10 @@ def opened(path: Path | None) -> Iterator[Database]:
 
 
 def print_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Rows under a head. The first column is never broken, and nothing is where nobody looks at a screen."""
+    """Rows under a head. The first column is never broken, and nothing is where nobody looks at a screen.
+
+    On a narrow screen, where a table would have no room for most of its columns, each row is a paragraph.
+    """
     import sys
 
     from rich import box
@@ -183,6 +194,12 @@ def print_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     from rich.text import Text
 
     console = Console(width=None if sys.stdout.isatty() else 1000)
+    if console.width < NARROW:
+        for first, *others in rows:
+            console.print(Text(first))
+            for title, cell in zip(head[1:], others, strict=True):
+                console.print(Text(f"  {title}: {cell}"))
+        return
     table = Table(box=box.SIMPLE_HEAD)
     for number, title in enumerate(head):
         table.add_column(title, no_wrap=number == 0)
@@ -193,12 +210,12 @@ def print_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
 
 def print_metrics(metrics: Sequence[Metric]) -> None:
     """Scores as a table, with their target bands."""
-    from trainer.reporting.wording import band
+    from trainer.reporting.wording import band, number
 
     rows = [
         (
             m.name,
-            "nothing measured" if m.value is None else f"{m.value:.4g} {m.unit}",
+            "nothing measured" if m.value is None else f"{number(m.value, m.unit)} {m.unit}",
             band(m.target_low, m.target_high, m.unit),
             m.source,
         )

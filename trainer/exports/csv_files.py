@@ -1,7 +1,9 @@
 """Sessions as four tidy CSV files: sessions, events, metrics and poses, with units in the columns' names.
 
 One row is one thing (a session, an event, a score, a tool at a tick), so that R, pandas and a spreadsheet
-read them as they are. Numbers are written so that they read back exactly; an empty cell is a missing value.
+read them as they are. Numbers are written so that they read back exactly; an empty cell is a missing value. A text
+that a spreadsheet would run as a formula (it begins with = + - or @, as a trainee's name may) gets an apostrophe before
+it, which R and pandas show.
 """
 
 from __future__ import annotations
@@ -25,6 +27,9 @@ SESSIONS = (
 EVENTS = ("session", "tick", "seq", "time_s", "tool", "kind", "data_json")
 METRICS = ("session", "metric", "value", "unit", "target_low", "target_high", "source", "version")
 POSES = ("session", "tick", "time_s", "tool", "x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz", "closure", "valid")
+
+#: What a formula begins with in a spreadsheet; numbers are no texts here.
+FORMULA = ("=", "+", "-", "@")
 
 Row = tuple[Any, ...]
 
@@ -62,6 +67,11 @@ def pose_rows(record: SessionRecord) -> Iterator[Row]:
             yield h.id, tick, tick / h.tick_hz, tool, *numbers, int(valid[i][k])
 
 
+def plain(row: Row) -> Row:
+    """The row with an apostrophe before each text that a spreadsheet would run."""
+    return tuple(f"'{cell}" if isinstance(cell, str) and cell.startswith(FORMULA) else cell for cell in row)
+
+
 FILES: dict[str, tuple[tuple[str, ...], Callable[[SessionRecord], Iterator[Row]]]] = {
     "sessions.csv": (SESSIONS, session_rows),
     "events.csv": (EVENTS, event_rows),
@@ -89,6 +99,6 @@ def write(records: Iterable[SessionRecord], folder: Path) -> dict[str, int]:
             for name, (_, rows_of) in FILES.items():
                 with naming(folder / name):
                     for row in rows_of(record):
-                        writers[name].writerow(row)
+                        writers[name].writerow(plain(row))
                         rows[name] += 1
     return rows

@@ -264,12 +264,12 @@ def _check_own(db: Database) -> None:
         applied = {m.name for m in migrations.applied(db)}
     except KeyError as error:  # sqlite_utils, where a damaged file has lost a column's name
         raise LogError(f"{path_of(db)}: {_DAMAGED}") from error
+    if not db.table_names():  # whoever was about to make them was interrupted
+        raise LogError(f"{path_of(db)}: holds no sessions yet; `trainer practice` logs the first")
     if not applied:
         raise LogError(f"{path_of(db)}: not a log: an SQLite file of another program")
     if applied - known:
-        raise LogError(
-            f"{path_of(db)}: written by a newer version of this program; update it with `pip install -U trainer`"
-        )
+        raise LogError(f"{path_of(db)}: written by a newer version of this program; read it with that one")
 
 
 def _check_version(db: Database) -> None:

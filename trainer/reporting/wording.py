@@ -46,12 +46,17 @@ LARGE_MN = 10_000.0
 #: So many reasons why a device did not see an instrument are told in one line.
 MOST_REASONS = 3
 
+#: Titles that say what a name cannot; an exercise's duration begins with the exercise.
+_TITLES = {"time_s": "Time from first motion"}
+
 #: Units that are no part of a reader's language.
 _UNIT_WORDS = {"deg": "°", "count": "", "ratio": "", "mm3": "mm³"}
 
 
 def title(metric: str) -> str:
     """A metric's name for a reader: without its unit and with spaces."""
+    if metric in _TITLES:
+        return _TITLES[metric]
     for suffix in ("_deg", "_mm", "_mm3", "_s", "_mN"):
         metric = metric.removesuffix(suffix)
     words = metric.replace("_", " ")
