@@ -198,7 +198,7 @@ def test_speed_error_writes_where_reports_are_and_a_short_run_replaces_no_whole_
     monkeypatch.chdir(tmp_path)
     if reports:
         (tmp_path / "reports").mkdir()
-    monkeypatch.setattr(page, "measure", lambda quick: rows())
+    monkeypatch.setattr(page, "measure", lambda quick, tell: rows())
     code, out, err = command_line("bench", "speed-error", *(["--quick"] if quick else []), "--json")
     assert code == 0
     assert json.loads(out)["quick"] is quick
@@ -215,7 +215,7 @@ def test_bench_alone_is_a_short_run_of_all(
     monkeypatch.chdir(tmp_path)
     asked: list[tuple[str, float]] = []
 
-    def measured(quick: bool) -> dict[str, list[Row]]:
+    def measured(quick: bool, tell: object) -> dict[str, list[Row]]:
         asked.append(("speed-error", quick))
         return rows()
 

@@ -92,7 +92,7 @@ def test_the_command_fails_when_a_law_is_broken(
 ) -> None:
     """And only then: a refusal and a method that says it did not converge are answers."""
     found = {"hard_thread": stability.collect(cases, False)}
-    monkeypatch.setattr(stability, "measure", lambda quick: found)
+    monkeypatch.setattr(stability, "measure", lambda quick, tell: found)
     ended, out, err = command_line("bench", "stability", "--quick", "--json", "--out", tmp_path / "here")
     assert ended == code
     answer = json.loads(out)
