@@ -321,6 +321,27 @@ def test_a_leap_of_20_mm_stays_finite_and_is_followed_in_steps(tissue: Tissue) -
     assert np.array_equal(state.x, tissue.mesh.rest)
 
 
+def test_what_is_held_a_million_times_stiffer_than_the_tissue_is_drawn_as_well() -> None:
+    """Out and back by 0.02 mm at a time: each equilibrium is found, and a hundred times stiffer than another hold this
+    one is the same but for what the other gives way, F / k; no more than 1e-4 mm then remain to either's residual."""
+    whole = vessel("A", 0.0, -1.0, layers=31, around=32)
+    mesh, node = whole.mesh, whole.node(15, 0)
+    ways = [0.02 * k * whole.twelve for k in (1, 2, 3, 4, 5, 6, 7, 6, 5, 4, 3, 2, 1)]
+    found = []
+    for stiffness in (1e7, 1e9):
+        state = Equilibrium(mesh, (whole.elimination,))
+        slot = np.array([state.hold(np.full(3, node), CORNER)])
+        answers = []
+        for way in ways:
+            held = Anchors(slot, (mesh.rest[node] + way)[None], stiffness * np.eye(3)[None])
+            answer = state.solve(held, tolerance_mN=3e-4)
+            assert answer.converged
+            answers.append((state.x.copy(), np.linalg.norm(answer.anchor_force)))
+        found.append(answers)
+    for (one, force), (other, _) in zip(*found, strict=True):
+        assert np.linalg.norm(one - other, axis=1).max() < force / 1e7 + 1e-4
+
+
 @pytest.mark.parametrize("bend_mm", [-0.6, 0.5])
 def test_a_factor_made_anew_changes_the_way_and_not_the_answer(tissue: Tissue, bend_mm: float) -> None:
     """A bent end, moved about until its stiffness was factored where it is: fewer iterations to the same place.

@@ -256,13 +256,17 @@ def minimise(
             energy = evaluate(x, bodies, rows, held, memory)
             residual = gradient(bodies, held, memory)
         slope = direction(bodies, base, rows, held, memory)
-        if not slope > 0.0:  # the pairs mislead: the base alone always leads down
+        far = largest(memory.z, bodies, held)
+        if not slope > 0.0 or far > bodies.longest_step:
+            # The pairs may mislead: rounding in them grows with a hold that is a million times stiffer than the tissue.
+            # The base alone always leads down.
             for b in held.awake:
                 memory.known[b] = 0
             slope = direction(bodies, base, rows, held, memory)
+            far = largest(memory.z, bodies, held)
             if not slope > 0.0:
                 return False, iteration, residual
-        t = min(1.0, bodies.longest_step / max(largest(memory.z, bodies, held), 1e-300))
+        t = min(1.0, bodies.longest_step / max(far, 1e-300))
         for b in held.awake:
             lo, hi = bodies.nodes[b, 0], bodies.nodes[b, 1]
             memory.old_force[lo:hi] = memory.force[lo:hi]
