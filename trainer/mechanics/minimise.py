@@ -71,7 +71,7 @@ class Memory(NamedTuple):
     y: Array  # (pairs, n, 3) mN
     product: Array  # (bodies, pairs) s · y
     newest: np.ndarray  # (bodies,) int64, the newest pair
-    known: np.ndarray  # (bodies,) int64, how many there are
+    known: np.ndarray  # (bodies,) int64, how many there are; less than none: see use_pairs
     force: Array  # (n, 3) mN, of the links at the last evaluation
     old_force: Array  # (n, 3)
     g: Array  # (n, 3)
@@ -195,6 +195,19 @@ def keep_pairs(x: Array, bodies: Bodies, held: Held, memory: Memory) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def use_pairs(held: Held, memory: Memory, wanted: bool) -> None:
+    """Each body's pairs count, or are kept and do not: as many less than none."""
+    for b in held.awake:
+        memory.known[b] = abs(memory.known[b]) if wanted else -memory.known[b]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def forget_pairs(held: Held, memory: Memory) -> None:
+    for b in held.awake:
+        memory.known[b] = 0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def largest(a: Array, bodies: Bodies, held: Held) -> float:
     """The largest absolute value in the rows of ``a`` (n, 3) that belong to the bodies that are solved for."""
     most = 0.0
@@ -259,11 +272,16 @@ def minimise(
         far = largest(memory.z, bodies, held)
         if not slope > 0.0 or far > bodies.longest_step:
             # The pairs may mislead: rounding in them grows with a hold that is a million times stiffer than the tissue.
-            # The base alone always leads down.
-            for b in held.awake:
-                memory.known[b] = 0
+            # The base alone always leads down; where it goes as far, it is the way that is long.
+            slope_with, far_with = slope, far
+            use_pairs(held, memory, False)
             slope = direction(bodies, base, rows, held, memory)
             far = largest(memory.z, bodies, held)
+            if slope_with > 0.0 and far > bodies.longest_step:
+                use_pairs(held, memory, True)
+                slope, far = direction(bodies, base, rows, held, memory), far_with
+            else:
+                forget_pairs(held, memory)
             if not slope > 0.0:
                 return False, iteration, residual
         t = min(1.0, bodies.longest_step / max(far, 1e-300))

@@ -171,7 +171,7 @@ def session_report(record: SessionRecord, task: Task) -> SessionReport:
         histogram=histogram([performance], task),
         tissue=tissue_rows(performance),
         events=event_lines(record.events),
-        overruns=sum(isinstance(e, TickOverrun) for e in record.events),
+        overruns=sum(isinstance(e, TickOverrun) and e.work_ms > e.slot_ms for e in record.events),
         out_of_sight=wording.out_of_sight(record.events),
     )
 
