@@ -29,6 +29,19 @@ def test_what_fails_in_a_piece_is_raised() -> None:
             share_out(fail, pieces)
 
 
+WORKED_BEFORE = """
+from trainer.mechanics import sharing
+for _ in range(20):
+    sharing.share_out(len, [(0, 1), (1, 2)])
+    sharing.start()
+"""
+
+
+def test_a_start_after_work_returns() -> None:
+    """A pool that has worked may have fewer threads than it can have; 60 s is for ever."""
+    subprocess.run([sys.executable, "-c", WORKED_BEFORE], check=True, timeout=60)
+
+
 BESIDE_A_TICK = """
 import os, threading
 from trainer.mechanics import sharing

@@ -33,19 +33,20 @@ def _threads() -> int:
 
 @cache
 def _pool() -> ThreadPoolExecutor:
-    """All threads but the caller's."""
-    return ThreadPoolExecutor(max(1, _threads() - 1), thread_name_prefix="volume")
+    """All threads but the caller's, and all of them from the beginning on: a pool that is left to itself starts one
+    more only when it takes those it has for busy."""
+    others = max(1, _threads() - 1)
+    pool, all_there = ThreadPoolExecutor(others, thread_name_prefix="volume"), Barrier(others + 1)
+    for _ in range(others):
+        pool.submit(all_there.wait)
+    all_there.wait()
+    return pool
 
 
 def start() -> None:
     """Count the cores and start the threads, before the caller takes a core to itself: afterwards it would see and
-    give to new threads no other."""
-    others = max(1, _threads() - 1)
-    all_there = Barrier(others + 1)
-    waiting = [_pool().submit(all_there.wait) for _ in range(others)]
-    all_there.wait()
-    for one in waiting:
-        one.result()
+    give to new threads no other. Where they are there already, nothing is done."""
+    _pool()
 
 
 def parts(begin: int, end: int, elements: int) -> list[tuple[int, int]]:
