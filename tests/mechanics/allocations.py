@@ -8,23 +8,27 @@ from collections.abc import Callable
 
 import numpy as np
 
+WARM_UPS = 100
 STRETCHES = 9
 RUNS = 10
+#: What the smallest array takes besides its numbers; a run that keeps less keeps none.
+ARRAY_HEADER = 112
 
 
-def kept_bytes(work: Callable[[], object]) -> tuple[int, int]:
-    """Bytes that ten runs of ``work`` keep, and the most that one run needs above what was there, after a warm-up.
+def kept_bytes(work: Callable[[], object]) -> tuple[float, int]:
+    """Bytes that each run of ``work`` keeps, and the most that one run needs above what was there, after a warm-up.
 
-    What ``work`` does, it does every time. Numba fills at some call or other what it keeps for all of them, and the
-    collector or another thread may come in between: the first figure is the median of nine stretches of ten runs, the
-    second the least of all runs. An array that each run kept would be 1120 bytes at least: ten headers of 112.
+    What ``work`` does, it does every time. Python and numba fill at some call or other what they keep for all of them
+    (strings of 53 bytes, about a hundred, at one line of a search), and the collector or another thread may come in
+    between: the first figure is that of the stretch of ten runs that kept least, the second the least of all runs.
     """
     kept, peaks = np.empty(STRETCHES), np.empty((STRETCHES, RUNS))  # before tracing begins: they would be counted
-    work()
+    work()  # kernels are compiled; under tracing that takes minutes
     gc.collect()
     tracemalloc.start()
     try:
-        work()  # what tracing itself keeps of the call
+        for _ in range(WARM_UPS):  # traced, for tracing itself keeps something of a call
+            work()
         for stretch in range(STRETCHES):
             start = tracemalloc.get_traced_memory()[0]
             for run in range(RUNS):
@@ -35,4 +39,4 @@ def kept_bytes(work: Callable[[], object]) -> tuple[int, int]:
             kept[stretch] = tracemalloc.get_traced_memory()[0] - start
     finally:
         tracemalloc.stop()
-    return int(np.median(kept)), int(peaks.min())
+    return float(kept.min()) / RUNS, int(peaks.min())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from allocations import kept_bytes
+from allocations import ARRAY_HEADER, kept_bytes
 from contact_samples import all_pairs, chain, margins, sample, samples
 from hypothesis import given
 from hypothesis import strategies as st
@@ -112,5 +112,5 @@ def test_refit_and_search_allocate_nothing() -> None:
         search.near(0.3)
 
     kept, peak = kept_bytes(tick)
-    assert kept < 1024
+    assert kept < ARRAY_HEADER
     assert peak < 2048

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from allocations import kept_bytes
+from allocations import ARRAY_HEADER, kept_bytes
 from contact_samples import KINDS, all_pairs, chain, margins, sample, samples
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -116,7 +116,7 @@ def test_a_search_allocates_nothing() -> None:
     thread, surface, triangles = sample("even", 1)
     cells = Cells(chain(13), triangles, surface)
     kept, peak = kept_bytes(lambda: cells.near(thread, surface, 0.3))
-    assert kept < 1024
+    assert kept < ARRAY_HEADER
     assert peak < 2048
 
 

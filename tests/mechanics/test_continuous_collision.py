@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from allocations import kept_bytes
+from allocations import ARRAY_HEADER, kept_bytes
 from contact_samples import chain
 from hypothesis import example, given
 from hypothesis import strategies as st
@@ -344,7 +344,7 @@ def test_more_pairs_than_ever_find_room_and_then_nothing_is_allocated() -> None:
     few = search.impacts(pairs[:5], thread0, thread1, x, x, 0.1).time.copy()
     assert np.array_equal(search.impacts(pairs, thread0, thread1, x, x, 0.1).time[:5], few)
     kept, peak = kept_bytes(lambda: search.impacts(pairs, thread0, thread1, x, x, 0.1))
-    assert kept < 1024
+    assert kept < ARRAY_HEADER
     assert peak < 2048
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from allocations import kept_bytes
+from allocations import ARRAY_HEADER, kept_bytes
 from contact_samples import all_own_pairs, chain, margins, sample, samples
 from hypothesis import given
 from hypothesis import strategies as st
@@ -82,5 +82,5 @@ def test_a_search_allocates_nothing() -> None:
     x, _, _ = sample("even", 1)
     search = SelfContact(chain(13))
     kept, peak = kept_bytes(lambda: search.near(x, 0.3))
-    assert kept < 1024
+    assert kept < ARRAY_HEADER
     assert peak < 2048
