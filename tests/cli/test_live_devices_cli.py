@@ -148,6 +148,10 @@ def test_points_are_touched_one_after_the_other(
         assert "the input ended before all was measured; no calibration is made" in err
         (kept,) = (tmp_path / "out").glob("*.readings-*-points.csv")
         assert len(fits.read_readings(kept).position) == 1
+        kept.unlink()
+        monkeypatch.setattr("sys.stdin", io.StringIO(""))
+        assert command_line("devices", "calibrate", profile, "--sensor", "bird2", "--points", table)[0] == 1
+        assert list((tmp_path / "out").glob("*.readings-*")) == []
         profile.write_text(text.replace('anchor = "none"', 'anchor = "home"'))
         before = len(asked)
         code, out, err = command_line("devices", "calibrate", profile, "--sensor", "bird2", "--points", table)

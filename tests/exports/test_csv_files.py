@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import csv
 import json
+import resource
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,12 +15,9 @@ import pytest
 
 from tests.metrics.synthetic_session import DRIVE, performed, record, task_of
 from trainer.events import from_row
-from trainer.exports import csv_files
 from trainer.exports.csv_files import FILES, write
 from trainer.exports.files import ExportError
 from trainer.metrics import score
-
-FULL = Path("/dev/full")
 
 
 def rows(path: Path) -> list[dict[str, str]]:
@@ -94,14 +94,24 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
         write([record()], tmp_path / "notes.txt")
 
 
-@pytest.mark.skipif(not FULL.exists(), reason="no disk that is always full")
-def test_a_full_disk_is_told_with_the_name_of_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whether the rows do not fit or what is left of them when the file is closed."""
-    monkeypatch.setattr(csv_files, "FILES", {str(FULL): FILES["poses.csv"]})
-    for many in (1, 50):
-        with pytest.raises(OSError, match="No space left") as caught:
-            write([performed(i, 0.5) for i in range(2)] * many, tmp_path / f"out {many}")
-        assert caught.value.filename == str(FULL)
+@contextmanager
+def little_room(size: int) -> Iterator[None]:
+    """Files of this process cannot grow beyond ``size`` bytes, as on a disk that is full."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize("size", [600, 20_000])
+def test_where_a_file_finds_no_room_it_is_named_and_nothing_half_written_stays(size: int, tmp_path: Path) -> None:
+    """Whether the rows do not fit or, of few, what is left of them when the file is closed: 8 kB wait until then."""
+    with little_room(size), pytest.raises(OSError, match="File too large") as caught:
+        write([performed(i, 0.5) for i in range(2)], tmp_path / "out")
+    assert Path(caught.value.filename).parent == tmp_path / "out"
+    assert list((tmp_path / "out").iterdir()) == []
 
 
 def test_an_empty_folder_may_be_filled(tmp_path: Path) -> None:

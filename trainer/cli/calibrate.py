@@ -102,7 +102,6 @@ def _touched(device: Watch | None, sensor: Sensor, places: Array, keep: Path) ->
     """
     import numpy as np
 
-    from trainer.calibration import CalibrationError
     from trainer.drivers.calibrate import KNOWN, READING, Readings
     from trainer.drivers.pose_table import QUATERNION
 
@@ -112,20 +111,30 @@ def _touched(device: Watch | None, sensor: Sensor, places: Array, keep: Path) ->
     typer.echo(f"trainer: readings are kept in {keep}", err=True)
     position: list[Array] = []
     quaternion: list[Array] = []
-    for k, place in enumerate(places.tolist(), 1):
-        where = ", ".join(f"{v:g}" for v in place)
-        while len(position) < k:
-            _wait_for(f"{k} of {len(places)}: {sensor.name} to ({where}) mm, hold it still, then Enter")
-            try:
-                p, q = device.touch(int(sensor.name.removeprefix("bird")))
-            except CalibrationError as error:
-                typer.echo(f"trainer: {error}; again", err=True)
-                continue
+    try:
+        for k, place in enumerate(places.tolist(), 1):
+            where = ", ".join(f"{v:g}" for v in place)
+            p, q = _touch(device, sensor, f"{k} of {len(places)}: {sensor.name} to ({where}) mm")
             position.append(p)
             quaternion.append(q)
             with keep.open("a", encoding="utf-8", newline="\n") as file:
                 file.write(",".join(repr(float(v)) for v in (*p, *q, *place)) + "\n")
+    finally:
+        if not position:  # given up before the first one
+            keep.unlink()
     return Readings(np.array(position), np.array(quaternion), places)
+
+
+def _touch(device: Watch, sensor: Sensor, what: str) -> tuple[Array, Array]:
+    """Where the sensor is held, (3,) mm and (4,), once it is held still."""
+    from trainer.calibration import CalibrationError
+
+    while True:
+        _wait_for(f"{what}, hold it still, then Enter")
+        try:
+            return device.touch(int(sensor.name.removeprefix("bird")))
+        except CalibrationError as error:
+            typer.echo(f"trainer: {error}; again", err=True)
 
 
 def _swept(device: Watch | None, sensor: Sensor) -> Sweep:

@@ -16,7 +16,7 @@ from typing import Any
 
 from trainer.curriculum import parse_task
 from trainer.events import payload
-from trainer.exports.files import close, make_room, naming
+from trainer.exports.files import make_room, naming, new_file
 from trainer.log.record import SessionRecord
 from trainer.metrics import score
 
@@ -83,16 +83,15 @@ FILES: dict[str, tuple[tuple[str, ...], Callable[[SessionRecord], Iterator[Row]]
 def write(records: Iterable[SessionRecord], folder: Path) -> dict[str, int]:
     """Write all files into a new or empty folder; returns the rows of each, without headings.
 
-    Records are taken one at a time. Raises ExportError where the folder holds something or is a file,
-    OSError where it cannot be written.
+    Records are taken one at a time; where one cannot be read or written, no file stays. Raises ExportError where the
+    folder holds something or is a file, OSError where it cannot be written.
     """
     make_room(folder)
     rows = dict.fromkeys(FILES, 0)
     with ExitStack() as stack:
         writers = {}
         for name, (columns, _) in FILES.items():
-            file = (folder / name).open("w", encoding="utf-8", newline="")
-            stack.callback(close, file, folder / name)
+            file = stack.enter_context(new_file(folder / name))
             writers[name] = csv.writer(file, lineterminator="\n")
             writers[name].writerow(columns)
         for record in records:

@@ -23,19 +23,20 @@ def make_room(folder: Path) -> None:
 
 @contextmanager
 def new_file(path: Path) -> Iterator[TextIO]:
-    """A text file that was not there before, with a line feed at the end of each line. Raises ExportError, OSError."""
+    """A text file that was not there before, with a line feed at the end of each line. Raises ExportError, OSError.
+
+    Where anything fails before it is whole, it is removed.
+    """
     try:
         file = path.open("x", encoding="utf-8", newline="")
     except FileExistsError:
         raise ExportError(f"{path}: exists already; nothing is overwritten, name a new file with --out") from None
-    with naming(path), file:
-        yield file
-
-
-def close(file: TextIO, path: Path) -> None:
-    """Close a file; what is still to be written may not fit."""
-    with naming(path):
-        file.close()
+    try:
+        with naming(path), file:
+            yield file
+    except BaseException:  # Ctrl-C as well
+        path.unlink(missing_ok=True)
+        raise
 
 
 @contextmanager
@@ -44,5 +45,5 @@ def naming(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        error.filename = str(path)
+        error.filename = error.filename or str(path)
         raise
