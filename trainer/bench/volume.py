@@ -21,6 +21,7 @@ from trainer.geometry import Array, Rigid, quaternion_from_axis_angle
 from trainer.mechanics.contact_response import push_out, surface_normals
 from trainer.mechanics.elastic_relaxation import SWEEPS, relax, sweep
 from trainer.mechanics.occupancy import OccupancyMap, surface_elements
+from trainer.mechanics.sharing import share_out
 from trainer.mechanics.volume import Material, Volume, VolumeState, build, bytes_per_element, places, start, wake
 from trainer.mechanics.volume_drag import drag
 
@@ -35,6 +36,8 @@ FRAMES, QUICK_FRAMES = 20, 6
 FAR, NEAR = 2.0, 1.0
 #: The bodies that move at once.
 BODY = 64
+#: The bodies move into each other: for so many times the frames of other cases, most of them pressed together.
+PRESSED = 3
 TISSUE = Material("tissue", (1.2,) * 3, (0.8,) * 3, (0.2,) * 3, young_kPa=100.0, shear_kPa=40.0, time_constant_s=0.1)
 FIRM = Material("firm", (1.1,) * 3, (0.9,) * 3, (0.1,) * 3, young_kPa=400.0, shear_kPa=160.0, time_constant_s=0.1)
 
@@ -306,18 +309,28 @@ class Bodies:
             pose = Rigid(self.at[b] + (0.5 * np.sin(0.2 * frame), 0.0, 0.0), turn)
             self._enter(b, pose.apply(self.rest))
             self.facing[b * n : (b + 1) * n] = pose.rotate(self.normals)
-        for b, state in enumerate(self.states):
+        tissues = [(0, 1), (1, 2)]  # at the same time: they meet in the map alone
+
+        def pull(tissue: tuple[int, int]) -> None:
+            state = self.states[tissue[0]]
             drag(self.volume, state, _middle(self.volume), self.side * 0.3 * np.array([np.sin(0.3 * frame), 0.2, 0.1]))
             relax(self.volume, state, 0.01)
+
+        share_out(pull, tissues)
+        for b, state in enumerate(self.states):
             self._enter(2 + b, places(self.volume, state, self.outer) + self.at[2 + b])
         pairs = self.map.touching()
         self.touched = len(pairs)
         entries, by = push_out(self.points, self.facing, pairs, self.soft, self.map.cell_mm)
-        for b, state in enumerate(self.states):
+
+        def give_way(tissue: tuple[int, int]) -> None:
+            b, state = tissue[0], self.states[tissue[0]]
             mine = (entries >= (2 + b) * n) & (entries < (3 + b) * n)
             held = self.outer[entries[mine] - (2 + b) * n]
             if len(held):
                 drag(self.volume, state, held, state.u[:, held].T + by[mine])
+
+        share_out(give_way, tissues)
 
     def _enter(self, body: int, points: Array) -> None:
         n = len(self.outer)
@@ -342,5 +355,5 @@ def measure(quick: bool, sizes: tuple[int, ...] | None = None) -> list[Row]:
         rows += whole(side, frames) + local(side, frames) + relaxation(side, frames)
     rows += mixed(sizes[0], frames) + growth(sizes[-1], frames)
     rows.append(trials(QUICK_TRIALS if quick else TRIALS, min(QUICK_TRIAL_SIDE if quick else TRIAL_SIDE, sizes[-1])))
-    rows += bodies(min(BODY, sizes[-1]), frames)
+    rows += bodies(min(BODY, sizes[-1]), PRESSED * frames)
     return rows if quick else rows + image(frames)
