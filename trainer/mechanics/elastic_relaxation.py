@@ -30,7 +30,7 @@ import numpy as np
 from numba import njit
 
 from trainer.geometry import Array
-from trainer.mechanics.prefetch import LINE, ask_for
+from trainer.mechanics.prefetch import LINE, ask_for_line
 from trainer.mechanics.sharing import parts, share_out
 from trainer.mechanics.tissue_law import constants, link_answer, rest_stiffness
 from trainer.mechanics.volume import FREE, PRESENT, Indices, Singles, Volume, VolumeState, grid_strides, wake
@@ -52,26 +52,44 @@ def _has(bits, bit):  # type: ignore[no-untyped-def]
     return np.uint8(bits & bit) != np.uint8(0)
 
 
-# Called for every few elements: a call of its own, with all that it is given, would take a tenth of the time.
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _smooth_run(u, ahead, links, begin, end, margin, nz, wx, wy, wz, now, other, still):  # type: ignore[no-untyped-def]
+def _goes_to(x, neighbours, bits, wx, wy, wz):  # type: ignore[no-untyped-def]
+    """Where an element at ``x`` goes. Where a link is missing the value that stands for the neighbour is not used."""
+    none = np.float32(0.0)
+    to, back, up, down, right, left = neighbours
+    pull = wx * ((to - x if _has(bits, 1) else none) + (back - x if _has(bits, 2) else none))
+    pull += wy * ((up - x if _has(bits, 4) else none) + (down - x if _has(bits, 8) else none))
+    pull += wz * ((right - x if _has(bits, 16) else none) + (left - x if _has(bits, 32) else none))
+    return x + (pull if _has(bits, FREE) else none)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _smooth_run(u, ahead, links, begin, end, margin, nz, wx, wy, wz, now, other, still, far):  # type: ignore[no-untyped-def]
     """The elements ``begin`` to ``end`` of a plane to where they go; returns how many went further than ``still``.
 
     ``now`` has where the plane was and ``other`` the one before, both after a ``margin``. ``ahead`` is the next
-    plane's, which ``other`` keeps. Where a link is missing the value that stands for the neighbour is not used.
+    plane's, which ``other`` keeps; where memory is ``far`` it is asked for, RUN elements at a time.
     """
-    none, one = np.float32(0.0), np.uint64(1)
-    for k in range(np.uint64(begin), np.uint64(end)):
-        m = k + margin
-        x, to, back, bits = now[m], ahead[k], other[m], links[k]
-        pull = wx * ((to - x if _has(bits, 1) else none) + (back - x if _has(bits, 2) else none))
-        pull += wy * ((now[m + nz] - x if _has(bits, 4) else none) + (now[m - nz] - x if _has(bits, 8) else none))
-        pull += wz * ((now[m + one] - x if _has(bits, 16) else none) + (now[m - one] - x if _has(bits, 32) else none))
-        u[k] = x + (pull if _has(bits, FREE) else none)
+    one, run = np.uint64(1), np.uint64(RUN)
+    first, past, rest = np.uint64(begin), np.uint64(end), np.uint64(begin)
+    if far:
+        rest += (past - first) // run * run
+        for a in range(first, rest, run):
+            for k in range(a, a + run, np.uint64(ALIGNED)):
+                ask_for_line(ahead, k + np.uint64(AHEAD))
+            for k in range(a, a + run):
+                m, to = k + margin, ahead[k]
+                around = (to, other[m], now[m + nz], now[m - nz], now[m + one], now[m - one])
+                u[k] = _goes_to(now[m], around, links[k], wx, wy, wz)
+                other[m] = to
+    for k in range(rest, past):
+        m, to = k + margin, ahead[k]
+        around = (to, other[m], now[m + nz], now[m - nz], now[m + one], now[m - one])
+        u[k] = _goes_to(now[m], around, links[k], wx, wy, wz)
         other[m] = to
     moving = 0
-    if still > none:
-        for k in range(np.uint64(begin), np.uint64(end)):
+    if still > np.float32(0.0):
+        for k in range(first, past):
             moving += 1 if abs(u[k] - now[k + margin]) > still else 0
     return moving
 
@@ -109,8 +127,7 @@ def _smooth_component(u, links, shape, box, wx, wy, wz, still, before, last, now
     ``wx``, ``wy`` and ``wz`` are the parts of the difference to each neighbour by which an element moves. ``before``
     holds the plane before the region, ``last`` the one after it, as they were before the sweep; they and ``now`` are
     planes with margins. So memory is read and written once. Rows are taken together where the region is more than half
-    as wide as the volume; and where that is more than the cache holds, RUN elements at a time, while the memory AHEAD of
-    them is on its way.
+    as wide as the volume; memory that the cache does not hold is then asked for.
     """
     _, ny, nz = shape
     plane, margin = ny * nz, _margin(nz)
@@ -127,20 +144,10 @@ def _smooth_component(u, links, shape, box, wx, wy, wz, still, before, last, now
         bits = links[i * plane : (i + 1) * plane]
         following = last[margin : margin + plane] if i == i1 else u[(i + 1) * plane : (i + 2) * plane]
         for j in range(j0, j0 + 1 if one else j1 + 1):
-            rest = j * nz + k0
-            past = end if one else j * nz + k1 + 1
-            if far:
-                runs = (past - rest) // RUN
-                for a in range(rest, rest + runs * RUN, RUN):
-                    ask_for(u, (i + 1) * plane + a + AHEAD, (i + 1) * plane + a + AHEAD + RUN)
-                    moving += _smooth_run(
-                        here, following, bits, a, a + RUN, np.uint64(margin), np.uint64(nz), wx, wy, wz, now, other,
-                        still,
-                    )  # fmt: skip
-                rest += runs * RUN
             moving += _smooth_run(
-                here, following, bits, rest, past, np.uint64(margin), np.uint64(nz), wx, wy, wz, now, other, still
-            )
+                here, following, bits, j * nz + k0, end if one else j * nz + k1 + 1, np.uint64(margin),
+                np.uint64(nz), wx, wy, wz, now, other, still, far,
+            )  # fmt: skip
         _keep(other, margin, following, low, begin if one else high)
         _keep(other, margin, following, end if one else high, high)
         now, other = other, now
@@ -341,9 +348,7 @@ def _sweep_pieces(
     def slab(piece: tuple[int, int]) -> int:
         own = (piece[0], piece[1] - 1, *box[1], *box[2])
         if same.linear:
-            return int(
-                smooth(state.u, state.links, volume.shape, own, same.ways, np.float32(still), room[piece])
-            )
+            return int(smooth(state.u, state.links, volume.shape, own, same.ways, np.float32(still), room[piece]))
         return sum(
             answer(
                 state.u[c], state.links, volume.labels.reshape(-1), volume.material_of, volume.shape, same.strides, own,

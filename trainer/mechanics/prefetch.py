@@ -7,7 +7,7 @@ no result; in plain Python it does nothing.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, SupportsIndex
 
 from llvmlite import ir
 from numba import njit, types
@@ -35,11 +35,11 @@ def _instruction(typing, values, index):  # type: ignore[no-untyped-def]
 _prefetch: Any = intrinsic(_instruction)
 
 
-def _ask(values: Any, index: int) -> None:
-    """Ask for the line of memory that an element lies in."""
+def ask_for_line(values: Any, index: SupportsIndex) -> None:
+    """Ask for the line of memory that an element lies in, or would; where there is no memory nothing comes."""
 
 
-@overload(_ask)
+@overload(ask_for_line)
 def _compiled(values, index):  # type: ignore[no-untyped-def]
     return lambda values, index: _prefetch(values, index)
 
@@ -48,4 +48,4 @@ def _compiled(values, index):  # type: ignore[no-untyped-def]
 def ask_for(values, begin, end):  # type: ignore[no-untyped-def]
     """Ask for the elements ``begin`` to ``end`` (not included) of ``values`` (n,), as far as they are there."""
     for k in range(max(begin, 0), min(end, len(values)), LINE // values.itemsize):
-        _ask(values, k)
+        ask_for_line(values, k)
