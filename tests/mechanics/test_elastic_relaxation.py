@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from pathlib import Path
 
@@ -124,10 +125,12 @@ def test_both_kernels_agree_on_one_linear_material(seed: int, narrow: bool) -> N
     np.testing.assert_allclose(results[0], results[1], atol=50 * EPS * 5)
 
 
+@pytest.mark.parametrize("narrow", [False, True])
 @pytest.mark.parametrize("shape", [(9, 8, 20), (72, 60, 64)])
-def test_a_sweep_is_what_all_elements_at_once_give(shape: tuple[int, int, int]) -> None:
+def test_a_sweep_is_what_all_elements_at_once_give(shape: tuple[int, int, int], narrow: bool) -> None:
     """The formula of the sweep by whole arrays, from the places before it: the same bits, with cuts and tacks, in a
-    volume that is smoothed in one run and in one that is larger than the cache and smoothed a part at a time."""
+    volume that is smoothed in one run and in one that is larger than the cache and smoothed a part at a time; all of it
+    and a part less than half as wide, around which one more element is swept and nothing else moves."""
     volume = block(shape)
     state = start(volume)
     cut_some(volume, state, 1, 0.2)
@@ -135,6 +138,12 @@ def test_a_sweep_is_what_all_elements_at_once_give(shape: tuple[int, int, int]) 
     tack(state, rng.integers(0, volume.labels.size, volume.labels.size // 9))
     state.u[:] = rng.normal(size=state.u.shape)
     everything_awake(volume, state)
+    swept = np.ones(shape, dtype=bool)
+    if narrow:
+        state.awake = None
+        wake(state, np.array([2, 3, 6], np.int32), np.array([shape[0] - 3, 5, 11], np.int32))
+        swept = np.zeros(shape, dtype=bool)
+        swept[1:-1, 2:7, 5:13] = True
     k = rest_stiffness(volume)[0]
     ways = (-math.expm1(-1.0 / SWEEPS) * k / (2.0 * k.sum(axis=0))).astype(np.float32)
     links = state.links.reshape(shape)
@@ -146,9 +155,31 @@ def test_a_sweep_is_what_all_elements_at_once_give(shape: tuple[int, int, int]) 
                 np.where(links & (1 << d), np.roll(x, (-1, 1)[d % 2], axis) - x, 0) for d in (2 * axis, 2 * axis + 1)
             ]
             pull = pull + ways[axis, c] * (apart[0] + apart[1])
-        expected[c] = np.where(links & FREE, x + pull, x)
+        expected[c] = np.where(swept & ((links & FREE) != 0), x + pull, x)
     sweep(volume, state, volume.materials[0].time_constant_s / SWEEPS)
     assert np.array_equal(state.u.reshape(3, *shape), expected)
+
+
+@given(seeds, st.integers(2, 12))
+def test_sweeps_together_are_sweeps_one_by_one(seed: int, count: int) -> None:
+    """The same bits, and the same region awake, which grows by an element with each sweep until it is all the volume;
+    with cuts and tacks."""
+    shape = (6, 7, 40)
+    volume = block(shape)
+    state = start(volume)
+    cut_some(volume, state, seed, 0.2)
+    rng = np.random.default_rng(seed)
+    tack(state, rng.integers(0, volume.labels.size, volume.labels.size // 9))
+    together, single = copy.deepcopy(state), copy.deepcopy(state)
+    u, lowest = rng.normal(size=state.u.shape), rng.integers(0, shape)
+    for each in (together, single):
+        each.u[:] = u
+        wake(each, lowest.astype(np.int32), lowest.astype(np.int32))
+    sweep(volume, together, 0.01, count=count)
+    for _ in range(count):
+        sweep(volume, single, 0.01, look=False)
+    assert np.array_equal(together.u, single.u)
+    assert np.array_equal(together.awake, single.awake)
 
 
 def test_several_threads_give_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -30,7 +30,8 @@ import numpy as np
 from numba import njit
 
 from trainer.geometry import Array
-from trainer.mechanics.prefetch import LINE, ask_for_line
+from trainer.mechanics.linear_sweeps import ALIGNED, keep, keep_borders, margin_of, smooth, smooth_on
+from trainer.mechanics.prefetch import LINE
 from trainer.mechanics.sharing import parts, share_out
 from trainer.mechanics.tissue_law import constants, link_answer, rest_stiffness
 from trainer.mechanics.volume import FREE, PRESENT, Indices, Singles, Volume, VolumeState, grid_strides, wake
@@ -39,149 +40,6 @@ from trainer.mechanics.volume import FREE, PRESENT, Indices, Singles, Volume, Vo
 SWEEPS = 8
 #: A region in which no element moves further than this in a sweep, in the shortest rest length, falls asleep.
 STILL = 1e-5
-#: Elements that are smoothed while memory is asked for that is so many further on; not of components that the cache
-#: holds. Measured: a sweep of 256³ takes two fifths less time; asked for 512 at once, memory keeps the processor waiting.
-RUN, AHEAD, CACHED = 128, 2048, 2**18
-#: Elements in a line of memory, with one of which planes begin: what straddles two is read and written twice.
-ALIGNED = LINE // 4
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _has(bits, bit):  # type: ignore[no-untyped-def]
-    """Whether a bit is set; in 8 bits, so that 16 elements are asked at once."""
-    return np.uint8(bits & bit) != np.uint8(0)
-
-
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _goes_to(x, neighbours, bits, wx, wy, wz):  # type: ignore[no-untyped-def]
-    """Where an element at ``x`` goes. Where a link is missing the value that stands for the neighbour is not used."""
-    none = np.float32(0.0)
-    to, back, up, down, right, left = neighbours
-    pull = wx * ((to - x if _has(bits, 1) else none) + (back - x if _has(bits, 2) else none))
-    pull += wy * ((up - x if _has(bits, 4) else none) + (down - x if _has(bits, 8) else none))
-    pull += wz * ((right - x if _has(bits, 16) else none) + (left - x if _has(bits, 32) else none))
-    return x + (pull if _has(bits, FREE) else none)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _smooth_run(u, ahead, links, begin, end, margin, nz, wx, wy, wz, now, other, still, far):  # type: ignore[no-untyped-def]
-    """The elements ``begin`` to ``end`` of a plane to where they go; returns how many went further than ``still``.
-
-    ``now`` has where the plane was and ``other`` the one before, both after a ``margin``. ``ahead`` is the next
-    plane's, which ``other`` keeps; where memory is ``far`` it is asked for, RUN elements at a time.
-    """
-    one, run = np.uint64(1), np.uint64(RUN)
-    first, past, rest = np.uint64(begin), np.uint64(end), np.uint64(begin)
-    if far:
-        rest += (past - first) // run * run
-        for a in range(first, rest, run):
-            for k in range(a, a + run, np.uint64(ALIGNED)):
-                ask_for_line(ahead, k + np.uint64(AHEAD))
-            for k in range(a, a + run):
-                m, to = k + margin, ahead[k]
-                around = (to, other[m], now[m + nz], now[m - nz], now[m + one], now[m - one])
-                u[k] = _goes_to(now[m], around, links[k], wx, wy, wz)
-                other[m] = to
-    for k in range(rest, past):
-        m, to = k + margin, ahead[k]
-        around = (to, other[m], now[m + nz], now[m - nz], now[m + one], now[m - one])
-        u[k] = _goes_to(now[m], around, links[k], wx, wy, wz)
-        other[m] = to
-    moving = 0
-    if still > np.float32(0.0):
-        for k in range(first, past):
-            moving += 1 if abs(u[k] - now[k + margin]) > still else 0
-    return moving
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _keep(plane, margin, u, begin, end):  # type: ignore[no-untyped-def]
-    """Copy the elements ``begin`` to ``end`` of ``u`` to a plane with a margin."""
-    past = np.uint64(margin)
-    for k in range(np.uint64(begin), np.uint64(end)):
-        plane[past + k] = u[k]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _margin(nz):  # type: ignore[no-untyped-def]
-    """Room before and after a plane: a row and one element, in whole lines of memory."""
-    return (nz + ALIGNED) // ALIGNED * ALIGNED
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _keep_borders(u, shape, begin, end, planes):  # type: ignore[no-untyped-def]
-    """Copy the plane of ``u`` (3, n) before ``begin`` and the one from ``end`` on to ``planes`` (3, 3, ·)."""
-    nx, ny, nz = shape
-    plane, margin = ny * nz, _margin(nz)
-    for c in range(3):
-        if begin > 0:
-            _keep(planes[c, 0], margin, u[c, (begin - 1) * plane : begin * plane], 0, plane)
-        if end < nx:
-            _keep(planes[c, 1], margin, u[c, end * plane : (end + 1) * plane], 0, plane)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _smooth_component(u, links, shape, box, wx, wy, wz, still, before, last, now):  # type: ignore[no-untyped-def]
-    """A sweep of one component ``u`` (n,) of one linear material; returns how many went further than ``still`` mm.
-
-    ``wx``, ``wy`` and ``wz`` are the parts of the difference to each neighbour by which an element moves. ``before``
-    holds the plane before the region, ``last`` the one after it, as they were before the sweep; they and ``now`` are
-    planes with margins. So memory is read and written once. Rows are taken together where the region is more than half
-    as wide as the volume; memory that the cache does not hold is then asked for.
-    """
-    _, ny, nz = shape
-    plane, margin = ny * nz, _margin(nz)
-    i0, i1, j0, j1, k0, k1 = box
-    one = 2 * (k1 + 1 - k0) > nz
-    far = one and len(u) > CACHED
-    begin, end = j0 * nz + k0, j1 * nz + k1 + 1
-    low, high = max(begin - nz - 1, 0), min(end + nz + 1, plane)
-    _keep(now, margin, u[i0 * plane : (i0 + 1) * plane], low, high)
-    other = before
-    moving = 0
-    for i in range(i0, i1 + 1):
-        here = u[i * plane : (i + 1) * plane]
-        bits = links[i * plane : (i + 1) * plane]
-        following = last[margin : margin + plane] if i == i1 else u[(i + 1) * plane : (i + 2) * plane]
-        for j in range(j0, j0 + 1 if one else j1 + 1):
-            moving += _smooth_run(
-                here, following, bits, j * nz + k0, end if one else j * nz + k1 + 1, np.uint64(margin),
-                np.uint64(nz), wx, wy, wz, now, other, still, far,
-            )  # fmt: skip
-        _keep(other, margin, following, low, begin if one else high)
-        _keep(other, margin, following, end if one else high, high)
-        now, other = other, now
-    return moving
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def smooth(u, links, shape, box, ways, still, planes):  # type: ignore[no-untyped-def]
-    """A sweep of the slab ``box`` of ``u`` (3, n), one linear material; returns how many went further than ``still``.
-
-    ``ways`` (3, 3) are by component and axis, and ``planes`` as :func:`_edges` has them: first, after, room.
-    """
-    moving = 0
-    for c in range(3):
-        moving += _smooth_component(
-            u[c], links, shape, box, ways[c, 0], ways[c, 1], ways[c, 2], still, planes[c, 0], planes[c, 1], planes[c, 2]
-        )
-    return moving
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def smooth_on(u, links, shape, box, count, ways, still, planes):  # type: ignore[no-untyped-def]
-    """``count`` sweeps like :func:`smooth` of a region that is ``box`` before, and with each one element more around;
-    returns how many went further than ``still`` in the last."""
-    nx, ny, nz = shape
-    i0, i1, j0, j1, k0, k1 = box
-    moving = 0
-    for left in range(count - 1, -1, -1):
-        i0, j0, k0 = max(i0 - 1, 0), max(j0 - 1, 0), max(k0 - 1, 0)
-        i1, j1, k1 = min(i1 + 1, nx - 1), min(j1 + 1, ny - 1), min(k1 + 1, nz - 1)
-        _keep_borders(u, shape, i0, i1 + 1, planes)
-        most = still if left == 0 else np.float32(0.0)
-        moving = smooth(u, links, shape, (i0, i1, j0, j1, k0, k1), ways, most, planes)
-    return moving
 
 
 # Laws go from function to function as tuples: arrays would be counted on the way in and out, nine tenths of the time.
@@ -203,11 +61,11 @@ def answer(u, links, labels, material_of, shape, strides, box, c, law, h, area, 
     ``rest`` (m, 3, 3) is the stiffness at rest and ``part`` (m,) how much of the way an element goes.
     """
     _, ny, nz = shape
-    plane, margin = ny * nz, _margin(nz)
+    plane, margin = ny * nz, margin_of(nz)
     i0, i1, j0, j1, k0, k1 = box
     moving = 0
     for i in range(i0, i1 + 1):
-        _keep(now, margin, u[i * plane : (i + 1) * plane], max(j0 - 1, 0) * nz, min(j1 + 2, ny) * nz)
+        keep(now, margin, u[i * plane : (i + 1) * plane], max(j0 - 1, 0) * nz, min(j1 + 2, ny) * nz)
         for j in range(j0, j1 + 1):
             for k in range(k0, k1 + 1):
                 e = i * plane + j * nz + k
@@ -342,11 +200,12 @@ def _sweep_pieces(
 ) -> int:
     """A sweep of ``box`` by as many threads as there are ``pieces``; returns how many went further than ``still``."""
     ways = _seam_ways(volume, state, same.rest, same.part, same.whole)
+    slabs = {piece: (piece[0], piece[1] - 1, *box[1], *box[2]) for piece in pieces}
     room = dict(zip(pieces, planes, strict=False))
-    share_out(lambda piece: _keep_borders(state.u, volume.shape, *piece, room[piece]), pieces)
+    share_out(lambda piece: keep_borders(state.u, volume.shape, slabs[piece], room[piece]), pieces)
 
     def slab(piece: tuple[int, int]) -> int:
-        own = (piece[0], piece[1] - 1, *box[1], *box[2])
+        own = slabs[piece]
         if same.linear:
             return int(smooth(state.u, state.links, volume.shape, own, same.ways, np.float32(still), room[piece]))
         return sum(
@@ -371,7 +230,7 @@ def _edges(volume: Volume, state: VolumeState, count: int) -> Singles:
     after it, and one more. Outside the volume leads no link."""
     _, ny, nz = volume.shape
     if state.edges is None or len(state.edges) < count:
-        size = -(-ny * nz // ALIGNED) * ALIGNED + 2 * _margin(nz)
+        size = -(-ny * nz // ALIGNED) * ALIGNED + 2 * margin_of(nz)
         room = np.zeros(count * 9 * size + ALIGNED, dtype=np.float32)
         first = -room.ctypes.data % LINE // room.itemsize
         state.edges = room[first : first + count * 9 * size].reshape(count, 3, 3, size)
