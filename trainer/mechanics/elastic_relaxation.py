@@ -30,7 +30,7 @@ import numpy as np
 from numba import njit
 
 from trainer.geometry import Array
-from trainer.mechanics.linear_sweeps import ALIGNED, keep, keep_borders, margin_of, smooth, smooth_on
+from trainer.mechanics.linear_sweeps import ALIGNED, keep, margin_of, smooth
 from trainer.mechanics.prefetch import LINE
 from trainer.mechanics.sharing import parts, share_out
 from trainer.mechanics.tissue_law import constants, link_answer, rest_stiffness
@@ -173,10 +173,10 @@ def sweep(volume: Volume, state: VolumeState, step_s: float, look: bool = True, 
     still = STILL * min(volume.spacing_mm) if look else 0.0
     planes = _edges(volume, state, len(pieces))
     if same.linear and len(pieces) == 1 and not len(state.seams.ends):
-        moving = smooth_on(
-            state.u, state.links, volume.shape, before[0] + before[1] + before[2], count, same.ways, np.float32(still),
-            planes[0],
-        )  # fmt: skip
+        region = before[0] + before[1] + before[2]
+        moving = smooth(
+            state.u, state.links, volume.shape, region, count, False, same.ways, np.float32(still), planes[0]
+        )
     elif count > 1:
         for left in range(count - 1, -1, -1):
             sweep(volume, state, step_s, look=look and left == 0)
@@ -200,14 +200,24 @@ def _sweep_pieces(
 ) -> int:
     """A sweep of ``box`` by as many threads as there are ``pieces``; returns how many went further than ``still``."""
     ways = _seam_ways(volume, state, same.rest, same.part, same.whole)
-    slabs = {piece: (piece[0], piece[1] - 1, *box[1], *box[2]) for piece in pieces}
     room = dict(zip(pieces, planes, strict=False))
-    share_out(lambda piece: keep_borders(state.u, volume.shape, slabs[piece], room[piece]), pieces)
+    nx, ny, nz = volume.shape
+    inside = slice(margin_of(nz), margin_of(nz) + ny * nz)
+    u = state.u.reshape(3, nx, ny * nz)
+
+    def keep_borders(piece: tuple[int, int]) -> None:
+        begin, end = piece
+        if begin > 0:
+            room[piece][:, 0, inside] = u[:, begin - 1]
+        if end < nx:
+            room[piece][:, 1, inside] = u[:, end]
 
     def slab(piece: tuple[int, int]) -> int:
-        own = slabs[piece]
+        own = (piece[0], piece[1] - 1, *box[1], *box[2])
         if same.linear:
-            return int(smooth(state.u, state.links, volume.shape, own, same.ways, np.float32(still), room[piece]))
+            return int(
+                smooth(state.u, state.links, volume.shape, own, 1, True, same.ways, np.float32(still), room[piece])
+            )
         return sum(
             answer(
                 state.u[c], state.links, volume.labels.reshape(-1), volume.material_of, volume.shape, same.strides, own,
@@ -216,6 +226,7 @@ def _sweep_pieces(
             for c in range(3)
         )  # fmt: skip
 
+    share_out(keep_borders, pieces)
     moving = sum(share_out(slab, pieces))
     if len(ways):
         for end in range(2):

@@ -105,7 +105,7 @@ def _keep_region(plane, u, shape, box):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def keep_borders(u, shape, box, planes):  # type: ignore[no-untyped-def]
+def _keep_borders(u, shape, box, planes):  # type: ignore[no-untyped-def]
     """Copy the planes of ``u`` (3, n) before the slab ``box`` and after it to ``planes`` (3, 3, ·)."""
     nx, ny, nz = shape
     plane = ny * nz
@@ -157,30 +157,27 @@ def _smooth_component(u, links, shape, box, wx, wy, wz, still, before, last, now
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def smooth(u, links, shape, box, ways, still, planes):  # type: ignore[no-untyped-def]
-    """A sweep of the slab ``box`` of ``u`` (3, n), one linear material; returns how many went further than ``still``.
+def smooth(u, links, shape, box, count, part, ways, still, planes):  # type: ignore[no-untyped-def]
+    """``count`` sweeps of ``u`` (3, n); returns how many went further than ``still`` mm in the last.
 
-    ``ways`` (3, 3) are by component and axis, and ``planes`` as :func:`_edges` has them: first, after, room.
+    ``box`` is a region, and each sweep takes one element more around it; or a ``part`` of one, a slab whose borders
+    ``planes`` hold. ``ways`` (3, 3) are by component and axis; ``planes`` (3, 3, ·) have room for a plane before the
+    slab, one after it and one more.
     """
-    moving = 0
-    for c in range(3):
-        moving += _smooth_component(
-            u[c], links, shape, box, ways[c, 0], ways[c, 1], ways[c, 2], still, planes[c, 0], planes[c, 1], planes[c, 2]
-        )
-    return moving
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def smooth_on(u, links, shape, box, count, ways, still, planes):  # type: ignore[no-untyped-def]
-    """``count`` sweeps like :func:`smooth` of a region that is ``box`` before, and with each one element more around;
-    returns how many went further than ``still`` in the last."""
     nx, ny, nz = shape
     i0, i1, j0, j1, k0, k1 = box
     moving = 0
     for left in range(count - 1, -1, -1):
-        i0, j0, k0 = max(i0 - 1, 0), max(j0 - 1, 0), max(k0 - 1, 0)
-        i1, j1, k1 = min(i1 + 1, nx - 1), min(j1 + 1, ny - 1), min(k1 + 1, nz - 1)
-        grown = (i0, i1, j0, j1, k0, k1)
-        keep_borders(u, shape, grown, planes)
-        moving = smooth(u, links, shape, grown, ways, still if left == 0 else np.float32(0.0), planes)
+        if not part:
+            i0, j0, k0 = max(i0 - 1, 0), max(j0 - 1, 0), max(k0 - 1, 0)
+            i1, j1, k1 = min(i1 + 1, nx - 1), min(j1 + 1, ny - 1), min(k1 + 1, nz - 1)
+            _keep_borders(u, shape, (i0, i1, j0, j1, k0, k1), planes)
+        most = still if left == 0 else np.float32(0.0)
+        moving = 0
+        for c in range(3):
+            wx, wy, wz = ways[c, 0], ways[c, 1], ways[c, 2]
+            before, last, now = planes[c, 0], planes[c, 1], planes[c, 2]
+            moving += _smooth_component(
+                u[c], links, shape, (i0, i1, j0, j1, k0, k1), wx, wy, wz, most, before, last, now
+            )
     return moving
