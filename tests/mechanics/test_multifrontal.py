@@ -7,7 +7,7 @@ import pytest
 from allocations import kept_bytes
 
 from trainer.geometry import Array
-from trainer.mechanics import multifrontal
+from trainer.mechanics import substitution
 from trainer.mechanics.links import LinkMesh, blocks, hessian, link_mesh
 from trainer.mechanics.multifrontal import GROUP, PANEL, TILE, Multifrontal, eliminate
 from trainer.mechanics.nested_dissection import Fronts, dissect
@@ -116,5 +116,5 @@ def test_a_solve_allocates_nothing() -> None:
     work.compute(blocks(mesh, mesh.rest))
     force, out = np.ones_like(mesh.rest), np.zeros_like(mesh.rest)
     work.solve(force, out)
-    _, most = kept_bytes(lambda: multifrontal.solve(work.factor, force, *work.scratch, out))
+    _, most = kept_bytes(lambda: substitution.solve(work.factor, force, *work.scratch, out))
     assert most < force.nbytes

@@ -24,11 +24,12 @@ import numpy as np
 from numba import njit
 
 from trainer.geometry import Array
-from trainer.mechanics import multifrontal
+from trainer.mechanics import substitution
 from trainer.mechanics.links import LinkMesh, add_forces, blocks, link_blocks
-from trainer.mechanics.multifrontal import Multifrontal, MultifrontalFactor
+from trainer.mechanics.multifrontal import Multifrontal
 from trainer.mechanics.nested_dissection import dissect
 from trainer.mechanics.newton import Outcome, multiply, refuse_loose_nodes, refuse_not_finite
+from trainer.mechanics.substitution import MultifrontalFactor
 
 #: More iterations than this in one step ask for a new factor, or as many as cost what the factor does: an iteration
 #: takes the time of so many arithmetic operations for each number in the factor (measured, within two).
@@ -253,7 +254,7 @@ def precondition(
     s: Scratch,
 ) -> None:
     """``s.z`` = M⁻¹ ``s.r`` with the held nodes at rest; overwrites ``s.q``."""
-    multifrontal.solve(factor, s.r, s.v, s.w, s.z)
+    substitution.solve(factor, s.r, s.v, s.w, s.z)
     share = s.q.reshape(-1)
     for i in range(len(inverse)):
         share[i] = 0.0

@@ -10,30 +10,18 @@ that it reads. A solve is right to about 1e-6 of its answer: a base for iteratio
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numba import njit
 
 from trainer.geometry import Array
 from trainer.mechanics.nested_dissection import Fronts
+from trainer.mechanics.substitution import MultifrontalFactor, solve
 
 #: A pivot below this share of the diagonal is lost in rounding: the matrix is singular, or not positive definite.
 SINGULAR = 1e-9
 #: Pivots that are subtracted from four rows in one pass; pivots of a panel, after which the rest of the front follows;
 #: columns of the tile of a panel that stays in the cache meanwhile.
 GROUP, PANEL, TILE = 8, 64, 256
-
-
-class MultifrontalFactor(NamedTuple):
-    """L and D of K = L D Lᵀ, front by front; the unknown 3 p + c is component c of the node at position p."""
-
-    fronts: Fronts
-    panel_start: np.ndarray  # (fronts + 1,) int64
-    panel: (
-        np.ndarray
-    )  # float32; front s has (3 pivots, 3 (pivots + rows)) of it by rows: Lᵀ, its diagonal and below unset
-    inverse: Array  # (3 f,) 1 / D
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -186,10 +174,12 @@ def _factor(
                         a[to + 2] += stack[of + 2]
         replaced += eliminate(a, size, pivots, inverse[3 * first : 3 * last], diagonal[3 * first : 3 * last], least)
         out = panel_start[s]
-        for k in range(pivots):
-            d = inverse[3 * first + k]
-            for j in range(k + 1, size):
-                panel[out + k * size + j] = a[k * size + j] * d
+        for k in range(0, pivots, 3):
+            for i in range(3):
+                d = inverse[3 * first + k + i]
+                for j in range(k + i + 1, size):
+                    panel[out + 3 * (j - k) + i] = a[(k + i) * size + j] * d
+            out += 3 * (size - k)
         width = size - pivots
         for i in range(width):
             stack[top + i * width + i : top + (i + 1) * width] = a[
@@ -220,84 +210,6 @@ def _stack_size(fronts: Fronts) -> int:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _forwards(factor: MultifrontalFactor, v: np.ndarray, w: np.ndarray) -> None:
-    """Overwrites ``v`` (3 f,) float32 with D⁻¹ L⁻¹ v; ``w`` is scratch as long as the longest row of a panel."""
-    fronts = factor.fronts
-    for s in range(len(fronts.parent)):
-        first, last = 3 * fronts.first[s], 3 * fronts.first[s + 1]
-        rows = fronts.row[fronts.row_start[s] : fronts.row_start[s + 1]]
-        pivots = last - first
-        size = pivots + 3 * len(rows)
-        w[:pivots] = v[first:last]
-        w[pivots:size] = np.float32(0.0)
-        for k in range(0, pivots, 3):
-            at = factor.panel_start[s] + k * size
-            l0, l1 = factor.panel[at : at + size], factor.panel[at + size : at + 2 * size]
-            l2 = factor.panel[at + 2 * size : at + 3 * size]
-            a0 = w[k]
-            w[k + 1] -= a0 * l0[k + 1]
-            a1 = w[k + 1]
-            w[k + 2] -= a0 * l0[k + 2] + a1 * l1[k + 2]
-            a2 = w[k + 2]
-            c0, c1, c2, target = l0[k + 3 :], l1[k + 3 :], l2[k + 3 :], w[k + 3 : size]
-            for j in range(size - k - 3):
-                target[j] -= a0 * c0[j] + a1 * c1[j] + a2 * c2[j]
-        v[first:last] = w[:pivots]
-        for k in range(len(rows)):
-            for c in range(3):
-                v[3 * rows[k] + c] += w[pivots + 3 * k + c]
-    for j in range(len(v)):
-        v[j] *= factor.inverse[j]
-
-
-# The sums may be reordered by the compiler, as in banded.substitute_backwards: they do not vectorise otherwise.
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc"})
-def _backwards(factor: MultifrontalFactor, v: np.ndarray, w: np.ndarray) -> None:
-    """Overwrites ``v`` (3 f,) float32 with L⁻ᵀ v; ``w`` as in :func:`_forwards`."""
-    fronts = factor.fronts
-    for s in range(len(fronts.parent) - 1, -1, -1):
-        first, last = 3 * fronts.first[s], 3 * fronts.first[s + 1]
-        rows = fronts.row[fronts.row_start[s] : fronts.row_start[s + 1]]
-        pivots = last - first
-        size = pivots + 3 * len(rows)
-        w[:pivots] = v[first:last]
-        for k in range(len(rows)):
-            for c in range(3):
-                w[pivots + 3 * k + c] = v[3 * rows[k] + c]
-        for k in range(pivots - 3, -1, -3):
-            at = factor.panel_start[s] + k * size
-            l0, l1 = factor.panel[at : at + size], factor.panel[at + size : at + 2 * size]
-            l2 = factor.panel[at + 2 * size : at + 3 * size]
-            c0, c1, c2, known = l0[k + 3 :], l1[k + 3 :], l2[k + 3 :], w[k + 3 : size]
-            s0 = s1 = s2 = np.float32(0.0)
-            for j in range(size - k - 3):
-                s0 += c0[j] * known[j]
-                s1 += c1[j] * known[j]
-                s2 += c2[j] * known[j]
-            w[k + 2] -= s2
-            w[k + 1] -= s1 + l1[k + 2] * w[k + 2]
-            w[k] -= s0 + l0[k + 1] * w[k + 1] + l0[k + 2] * w[k + 2]
-        v[first:last] = w[:pivots]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def solve(factor: MultifrontalFactor, values: Array, v: np.ndarray, w: np.ndarray, out: Array) -> None:
-    """K⁻¹ of the forces ``values`` (n, 3) mN on the factor's nodes into the same rows of ``out`` (n, 3) mm.
-
-    Overwrites ``v`` (3 f,) float32 and ``w`` (longest row of a panel,) float32.
-    """
-    order = factor.fronts.order
-    for p in range(len(order)):
-        for c in range(3):
-            v[3 * p + c] = values[order[p], c]
-    _forwards(factor, v, w)
-    _backwards(factor, v, w)
-    for p in range(len(order)):
-        for c in range(3):
-            out[order[p], c] = v[3 * p + c]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
 def _sum_diagonal(blocks: Array, links: np.ndarray, place: np.ndarray, out: Array) -> None:
     """The diagonal (3 f,) of the whole matrix."""
     out[:] = 0.0
@@ -316,7 +228,7 @@ class Multifrontal:
         """Of a stiffness that the ``links`` (m, 2) add up to on the nodes of ``fronts``."""
         pivots = np.diff(fronts.first)
         sizes = 3 * (pivots + np.diff(fronts.row_start))
-        panel_start = np.concatenate([[0], np.cumsum(3 * pivots * sizes)])
+        panel_start = np.concatenate([[0], np.cumsum(3 * pivots * sizes - 9 * pivots * (pivots - 1) // 2)])
         longest = int(np.max(sizes, initial=0))
         # Σ (size - k)² over the pivots k of each front.
         rest = sizes - 3 * pivots
