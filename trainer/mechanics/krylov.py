@@ -1,8 +1,8 @@
 """Newton's method for big meshes: conjugate gradients over a kept factor, in a region of trust.
 
-A factor of an earlier stiffness answers most of a new one: the two differ where the mesh has turned or stretched since,
-which is near the instrument. So Newton's equation is solved by conjugate gradients with the exact second derivatives
-and the old factor M as preconditioner. Where the energy curves down, or the step gets longer than the quadratic model
+A factor of an earlier stiffness answers most of a new one, and better with a small new one near the instrument
+(``preconditioner``). So Newton's equation is solved by conjugate gradients with the exact second derivatives, and these
+two M⁻¹ as preconditioner. Where the energy curves down, or the step gets longer than the quadratic model
 deserves trust, the step ends at the border of the region |p|_M <= radius (Steihaug 1983, SIAM J. Numer. Anal. 20:626;
 Nocedal and Wright, Numerical Optimization, algorithms 4.1 and 7.2). A step that does not lower the energy is not taken,
 so that the energy never rises but by rounding. Iterations are counted, and many ask for a new factor.
@@ -24,7 +24,7 @@ from trainer.mechanics.quasi_newton import add_scaled, dot
 
 #: More iterations than this in one step ask for a new factor, or as many as cost what the factor does: an iteration
 #: takes the time of so many arithmetic operations for each number in the factor (measured, within two).
-SLOW, ITERATION_COST = 30, 16.0
+SLOW, ITERATION_COST = 30, 9.0
 #: So many times as many iterations in all steps of one move do so, too: the region of trust is measured by the factor.
 MANY = 3
 #: Iterations after which a step ends as it is.
@@ -67,6 +67,7 @@ class NewtonKrylov:
         self._longest = LONGEST * float(np.median(mesh.rest_length))
         self._trial, self._step, self._way = (np.zeros_like(mesh.rest) for _ in range(3))
         self._force, self._trial_force = np.zeros_like(mesh.rest), np.zeros_like(mesh.rest)
+        self._no_load = np.zeros_like(mesh.rest)
         self._scratch = Scratch(*(np.zeros_like(mesh.rest) for _ in range(4)))
 
     def move(
@@ -83,7 +84,7 @@ class NewtonKrylov:
         Raises ValueError when a place or a load is not finite.
         """
         refuse_not_finite(places, load)
-        load = np.zeros_like(self.x) if load is None else load
+        load = self._no_load if load is None else load
         self._spent = 0
         self._base.hold(nodes)
         energy = self._predict(nodes, places, load)
@@ -97,7 +98,7 @@ class NewtonKrylov:
             decrease, length, cut = self._solve(self._force, accuracy, radius)
             np.add(self.x, self._step, out=self._trial)
             lower = self._evaluate(self._trial, load, self._trial_force)
-            noise = self._rounding * (abs(energy) + float(np.sum(np.abs(load * self.x))))
+            noise = self._rounding * (abs(energy) + self._work_of(load))
             trial_residual = float(np.linalg.norm(self._trial_force))
             share = (energy - lower) / decrease if decrease > 0.0 else -1.0
             if decrease <= 100.0 * noise and lower <= energy + noise and trial_residual < residual:
@@ -143,7 +144,7 @@ class NewtonKrylov:
             self._evaluate(x, load, self._force)
             self._update()
             multiply(self._block, self.mesh.links, way, self._trial_force)
-            self._trial_force[~self._base.free] = 0.0
+            _zero(self._base.free, self._trial_force)
             np.subtract(self._force, self._trial_force, out=self._trial_force)
             self._solve(self._trial_force, FIRST_ACCURACY, math.inf)
             trial += self._step
@@ -173,8 +174,13 @@ class NewtonKrylov:
         m = self.mesh
         force[:] = load
         energy = add_forces(x, m.links, m.rest_length, m.stiffness, 0, len(m.links), force)
-        force[~self._base.free] = 0.0
+        _zero(self._base.free, force)
         return float(energy - np.vdot(load, x))
+
+    def _work_of(self, load: Array) -> float:
+        """The sum of what its terms come to, mN mm, whatever their signs; overwrites ``_way``."""
+        np.multiply(load, self.x, out=self._way)
+        return float(np.sum(np.abs(self._way, out=self._way)))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -10,6 +10,8 @@ that it reads. A solve is right to about 1e-6 of its answer: a base for iteratio
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 
@@ -24,15 +26,27 @@ SINGULAR = 1e-9
 GROUP, PANEL, TILE = 8, 64, 256
 
 
+class Work(NamedTuple):
+    """What a factorisation overwrites."""
+
+    front: Array  # (largest front²,)
+    stack: Array  # (most numbers that lie on it at once,)
+    waiting: np.ndarray  # (fronts,) int64, the fronts whose update matrices lie on the stack
+    local: np.ndarray  # (f,) int64, the place of a node in the front at hand
+    packed: Array  # (PANEL TILE,) a tile of a panel
+    multiples: Array  # (4 GROUP,)
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
-def eliminate(a: Array, size: int, pivots: int, inverse: Array, diagonal: Array, least: float) -> int:
+def eliminate(
+    a: Array, size: int, pivots: int, inverse: Array, diagonal: Array, least: float, packed: Array, m: Array
+) -> int:
     """Eliminates the first ``pivots`` of the unknowns of a front from ``a``, by rows (size, size), upper half.
 
     Its rows become D Lᵀ and the rest what remains. A pivot below the share ``least`` of ``diagonal`` is replaced by
-    it; returns how often that was done.
+    it; returns how often that was done. ``packed`` (PANEL TILE,) and ``m`` (4 GROUP,) are scratch.
     """
     replaced = 0
-    packed, m = np.zeros(PANEL * TILE), np.zeros(4 * GROUP)
     for low in range(0, pivots, PANEL):
         high = min(low + PANEL, pivots)
         for first in range(low, high, GROUP):
@@ -118,23 +132,18 @@ def _factor(
     panel_start: np.ndarray,
     panel: np.ndarray,
     inverse: Array,
-    front: Array,
-    stack: Array,
     diagonal: Array,
-    local: np.ndarray,
     least: float,
+    work: Work,
 ) -> int:
-    """All fronts in turn; ``front``, ``stack`` are scratch. Returns how many pivots were too small."""
-    top = 0
-    replaced = 0
-    count = len(fronts.parent)
-    waiting = np.zeros(count, dtype=np.int64)  # the fronts whose update matrices lie on the stack
-    depth = 0
-    for s in range(count):
+    """All fronts in turn. Returns how many pivots were too small."""
+    stack, waiting, local = work.stack, work.waiting, work.local
+    replaced = top = depth = 0
+    for s in range(len(fronts.parent)):
         first, last = fronts.first[s], fronts.first[s + 1]
         rows = fronts.row[fronts.row_start[s] : fronts.row_start[s + 1]]
         pivots, size = 3 * (last - first), 3 * (last - first + len(rows))
-        a = front[: size * size]
+        a = work.front[: size * size]
         a[:] = 0.0
         for p in range(first, last):
             local[p] = 3 * (p - first)
@@ -172,7 +181,10 @@ def _factor(
                         a[to] += stack[of]
                         a[to + 1] += stack[of + 1]
                         a[to + 2] += stack[of + 2]
-        replaced += eliminate(a, size, pivots, inverse[3 * first : 3 * last], diagonal[3 * first : 3 * last], least)
+        replaced += eliminate(
+            a, size, pivots, inverse[3 * first : 3 * last], diagonal[3 * first : 3 * last], least, work.packed,
+            work.multiples,
+        )  # fmt: skip
         out = panel_start[s]
         for k in range(0, pivots, 3):
             for i in range(3):
@@ -238,10 +250,11 @@ class Multifrontal:
         self.factor = MultifrontalFactor(
             fronts, panel_start, np.full(int(panel_start[-1]), 0.0, dtype=np.float32), np.zeros(f)
         )
-        self._front = np.zeros(longest * longest)
-        self._stack = np.zeros(_stack_size(fronts))
         self._diagonal = np.zeros(f)
-        self._local = np.zeros(len(fronts.order), dtype=np.int64)
+        self._work = Work(
+            np.zeros(longest * longest), np.zeros(_stack_size(fronts)), np.zeros(len(fronts.parent), dtype=np.int64),
+            np.zeros(len(fronts.order), dtype=np.int64), np.zeros(PANEL * TILE), np.zeros(4 * GROUP),
+        )  # fmt: skip
         self.scratch = (np.zeros(f, dtype=np.float32), np.zeros(longest, dtype=np.float32))  # v, w of solve
 
     def compute(self, blocks: Array) -> bool:
@@ -249,8 +262,7 @@ class Multifrontal:
         f = self.factor
         _sum_diagonal(blocks, self._links, f.fronts.place, self._diagonal)
         replaced = _factor(
-            blocks, self._links, f.fronts, f.panel_start, f.panel, f.inverse, self._front, self._stack,
-            self._diagonal, self._local, SINGULAR,
+            blocks, self._links, f.fronts, f.panel_start, f.panel, f.inverse, self._diagonal, SINGULAR, self._work,
         )  # fmt: skip
         return replaced == 0
 

@@ -23,9 +23,7 @@ class MultifrontalFactor(NamedTuple):
 
     fronts: Fronts
     panel_start: np.ndarray  # (fronts + 1,) int64
-    panel: (
-        np.ndarray
-    )  # float32; for each pivot node of a front (its own row and those below, 3) of L
+    panel: np.ndarray  # float32; for each pivot node of a front (its own row and those below, 3) of L
     inverse: Array  # (3 f,) 1 / D
 
 
