@@ -129,7 +129,6 @@ def _factor(
     blocks: Array,
     links: np.ndarray,
     fronts: Fronts,
-    panel_start: np.ndarray,
     panel: np.ndarray,
     inverse: Array,
     diagonal: Array,
@@ -138,7 +137,7 @@ def _factor(
 ) -> int:
     """All fronts in turn. Returns how many pivots were too small."""
     stack, waiting, local = work.stack, work.waiting, work.local
-    replaced = top = depth = 0
+    replaced = top = depth = out = 0
     for s in range(len(fronts.parent)):
         first, last = fronts.first[s], fronts.first[s + 1]
         rows = fronts.row[fronts.row_start[s] : fronts.row_start[s + 1]]
@@ -185,7 +184,6 @@ def _factor(
             a, size, pivots, inverse[3 * first : 3 * last], diagonal[3 * first : 3 * last], least, work.packed,
             work.multiples,
         )  # fmt: skip
-        out = panel_start[s]
         for k in range(0, pivots, 3):
             for i in range(3):
                 d = inverse[3 * first + k + i]
@@ -240,16 +238,14 @@ class Multifrontal:
         """Of a stiffness that the ``links`` (m, 2) add up to on the nodes of ``fronts``."""
         pivots = np.diff(fronts.first)
         sizes = 3 * (pivots + np.diff(fronts.row_start))
-        panel_start = np.concatenate([[0], np.cumsum(3 * pivots * sizes - 9 * pivots * (pivots - 1) // 2)])
+        numbers = int(np.sum(3 * pivots * sizes - 9 * pivots * (pivots - 1) // 2))
         longest = int(np.max(sizes, initial=0))
         # Σ (size - k)² over the pivots k of each front.
         rest = sizes - 3 * pivots
         self.operations = float(np.sum((sizes.astype(float) ** 3 - rest.astype(float) ** 3) / 3.0))
         f = 3 * len(fronts.order)
         self._links = links
-        self.factor = MultifrontalFactor(
-            fronts, panel_start, np.full(int(panel_start[-1]), 0.0, dtype=np.float32), np.zeros(f)
-        )
+        self.factor = MultifrontalFactor(fronts, np.zeros(numbers, dtype=np.float32), np.zeros(f))
         self._diagonal = np.zeros(f)
         self._work = Work(
             np.zeros(longest * longest), np.zeros(_stack_size(fronts)), np.zeros(len(fronts.parent), dtype=np.int64),
@@ -262,7 +258,7 @@ class Multifrontal:
         f = self.factor
         _sum_diagonal(blocks, self._links, f.fronts.place, self._diagonal)
         replaced = _factor(
-            blocks, self._links, f.fronts, f.panel_start, f.panel, f.inverse, self._diagonal, SINGULAR, self._work,
+            blocks, self._links, f.fronts, f.panel, f.inverse, self._diagonal, SINGULAR, self._work,
         )  # fmt: skip
         return replaced == 0
 

@@ -22,7 +22,6 @@ class MultifrontalFactor(NamedTuple):
     """L and D of K = L D Lᵀ, front by front; the unknown 3 p + c is component c of the node at position p."""
 
     fronts: Fronts
-    panel_start: np.ndarray  # (fronts + 1,) int64
     panel: np.ndarray  # float32; for each pivot node of a front (its own row and those below, 3) of L
     inverse: Array  # (3 f,) 1 / D
 
