@@ -7,7 +7,7 @@ import pytest
 from allocations import kept_bytes
 
 from trainer.geometry import Array
-from trainer.mechanics import multifrontal
+from trainer.mechanics import substitution
 from trainer.mechanics.links import LinkMesh, blocks, hessian, link_mesh
 from trainer.mechanics.multifrontal import GROUP, PANEL, TILE, Multifrontal, eliminate
 from trainer.mechanics.nested_dissection import Fronts, dissect
@@ -64,7 +64,8 @@ def test_elimination_leaves_the_schur_complement(size: int) -> None:
     a = half @ half.T + size * np.eye(size)
     pivots = 3 * ((2 * size) // 9) or 3
     work, inverse = np.triu(a).ravel().copy(), np.zeros(pivots)
-    assert eliminate(work, size, pivots, inverse, np.diagonal(a).copy(), 1e-9) == 0
+    scratch = np.zeros(PANEL * TILE), np.zeros(4 * GROUP)
+    assert eliminate(work, size, pivots, inverse, np.diagonal(a).copy(), 1e-9, *scratch) == 0
     left = np.triu(work.reshape(size, size)[pivots:, pivots:])
     expected = a[pivots:, pivots:] - a[pivots:, :pivots] @ np.linalg.solve(a[:pivots, :pivots], a[:pivots, pivots:])
     assert np.allclose(left, np.triu(expected), rtol=0.0, atol=1e-14 * size * np.max(np.abs(a)))
@@ -116,5 +117,5 @@ def test_a_solve_allocates_nothing() -> None:
     work.compute(blocks(mesh, mesh.rest))
     force, out = np.ones_like(mesh.rest), np.zeros_like(mesh.rest)
     work.solve(force, out)
-    _, most = kept_bytes(lambda: multifrontal.solve(work.factor, force, *work.scratch, out))
+    _, most = kept_bytes(lambda: substitution.solve(work.factor, force, *work.scratch, out))
     assert most < force.nbytes

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from allocations import kept_bytes
 
 from trainer.geometry import Array
 from trainer.mechanics.krylov import NewtonKrylov
@@ -195,6 +196,22 @@ def test_the_same_bits_again_and_in_several_threads_at_once(kind: Kind) -> None:
         t.join()
     assert len(found) == 3
     assert all(np.array_equal(x, once) for x in found)
+
+
+def test_a_frame_of_newton_krylov_allocates_nothing() -> None:
+    """Beyond what the interpreter needs for calls, and a few flags for each node: less than one vector of the mesh."""
+    mesh = block((15, 6, 6))
+    node = corner(mesh)
+    method = NewtonKrylov(mesh)
+    ends = [mesh.rest[node] + [0.0, way, 0.0] for way in (0.1, 0.2)]
+
+    def out_and_back() -> None:
+        for place in ends:
+            assert method.move(node, place, tolerance_mN=1e-3).converged
+
+    kept, most = kept_bytes(out_and_back)
+    assert kept < 112
+    assert most < mesh.rest.nbytes
 
 
 def test_without_compilation_the_same_answer(tmp_path: Path) -> None:

@@ -1,18 +1,11 @@
 """Newton's method for big meshes: conjugate gradients over a kept factor, in a region of trust.
 
-A factor of an earlier stiffness answers most of a new one: the two differ where the mesh has turned or stretched since,
-which is near the instrument. So Newton's equation is solved by conjugate gradients with the exact second derivatives
-and the old factor M as preconditioner. Where the energy curves down, or the step gets longer than the quadratic model
+A factor of an earlier stiffness answers most of a new one, and better with a small new one near the instrument
+(``preconditioner``). So Newton's equation is solved by conjugate gradients with the exact second derivatives, and these
+two M⁻¹ as preconditioner. Where the energy curves down, or the step gets longer than the quadratic model
 deserves trust, the step ends at the border of the region |p|_M <= radius (Steihaug 1983, SIAM J. Numer. Anal. 20:626;
 Nocedal and Wright, Numerical Optimization, algorithms 4.1 and 7.2). A step that does not lower the energy is not taken,
 so that the energy never rises but by rounding. Iterations are counted, and many ask for a new factor.
-
-Held nodes do not change the factor, which is of all nodes that are not fixed for good. Its inverse restricted to the
-others is
-
-    K_ff⁻¹ r = K⁻¹ r - K⁻¹ E (Eᵀ K⁻¹ E)⁻¹ Eᵀ K⁻¹ r
-
-with the unit columns E of the held nodes' coordinates.
 """
 
 from __future__ import annotations
@@ -24,25 +17,24 @@ import numpy as np
 from numba import njit
 
 from trainer.geometry import Array
-from trainer.mechanics import multifrontal
-from trainer.mechanics.links import LinkMesh, add_forces, blocks, link_blocks
-from trainer.mechanics.multifrontal import Multifrontal, MultifrontalFactor
-from trainer.mechanics.nested_dissection import dissect
+from trainer.mechanics.links import LinkMesh, add_forces
 from trainer.mechanics.newton import Outcome, multiply, refuse_loose_nodes, refuse_not_finite
+from trainer.mechanics.preconditioner import Kept, Preconditioner, precondition
+from trainer.mechanics.quasi_newton import add_scaled, dot
 
 #: More iterations than this in one step ask for a new factor, or as many as cost what the factor does: an iteration
 #: takes the time of so many arithmetic operations for each number in the factor (measured, within two).
-SLOW, ITERATION_COST = 30, 16.0
+SLOW, ITERATION_COST = 30, 9.0
 #: So many times as many iterations in all steps of one move do so, too: the region of trust is measured by the factor.
 MANY = 3
 #: Iterations after which a step ends as it is.
 MOST = 200
 #: The least accuracy of a linear solve, as a share of its right-hand side.
-FIRST_ACCURACY = 0.1
+FIRST_ACCURACY = 0.03
 #: Share of the predicted decrease that a step must bring; and those below and above which the region changes.
 TAKEN, POOR, GOOD = 1e-4, 0.25, 0.75
-#: Share of an energy that is lost to rounding when it is summed over thousands of links.
-ROUNDING = 1e-14
+#: Share of an energy that is lost to rounding when it is summed over m links, over √m: three standard deviations.
+ROUNDING = 3.0 * float(np.finfo(float).eps)
 #: No node goes further in one step than this, in median links.
 LONGEST = 2.0
 
@@ -54,8 +46,6 @@ class Scratch(NamedTuple):
     z: Array  # (n, 3)
     p: Array  # (n, 3)
     q: Array  # (n, 3)
-    v: np.ndarray  # (3 f,) float32
-    w: np.ndarray  # (longest row of a panel,) float32
 
 
 class NewtonKrylov:
@@ -68,22 +58,17 @@ class NewtonKrylov:
         self.x = mesh.rest.copy()
         self.iterations = 0  # of conjugate gradients, so far
         self.factors = 1  # made so far
-        self._factoring = Multifrontal(mesh.links, dissect(mesh))
-        self._block = blocks(mesh, mesh.rest)
-        if not self._factoring.compute(self._block):
-            raise ValueError("the links do not hold all free nodes in place: the stiffness matrix is singular")
+        self._base = Preconditioner(mesh)
+        self._block = np.zeros((len(mesh.links), 3, 3))
         self._slow = False
         self._spent = 0  # iterations of this move with this factor
-        self._slow_from = max(SLOW, self._factoring.operations / (ITERATION_COST * len(self._factoring.factor.panel)))
-        self._free = ~mesh.fixed
-        self._held = np.zeros(0, dtype=np.int64)
-        self._columns = np.zeros((0, *mesh.rest.shape))
-        self._inverse = np.zeros((0, 0))
+        self._slow_from = max(SLOW, self._base.operations / ITERATION_COST)
+        self._rounding = ROUNDING * math.sqrt(len(mesh.links))
         self._longest = LONGEST * float(np.median(mesh.rest_length))
         self._trial, self._step, self._way = (np.zeros_like(mesh.rest) for _ in range(3))
         self._force, self._trial_force = np.zeros_like(mesh.rest), np.zeros_like(mesh.rest)
-        r, z, p, q = (np.zeros_like(mesh.rest) for _ in range(4))
-        self._scratch = Scratch(r, z, p, q, *self._factoring.scratch)
+        self._no_load = np.zeros_like(mesh.rest)
+        self._scratch = Scratch(*(np.zeros_like(mesh.rest) for _ in range(4)))
 
     def move(
         self,
@@ -99,9 +84,9 @@ class NewtonKrylov:
         Raises ValueError when a place or a load is not finite.
         """
         refuse_not_finite(places, load)
-        load = np.zeros_like(self.x) if load is None else load
+        load = self._no_load if load is None else load
         self._spent = 0
-        self._hold(nodes)
+        self._base.hold(nodes)
         energy = self._predict(nodes, places, load)
         first = residual = float(np.linalg.norm(self._force))
         radius = math.inf
@@ -113,7 +98,7 @@ class NewtonKrylov:
             decrease, length, cut = self._solve(self._force, accuracy, radius)
             np.add(self.x, self._step, out=self._trial)
             lower = self._evaluate(self._trial, load, self._trial_force)
-            noise = ROUNDING * (abs(energy) + float(np.sum(np.abs(load * self.x))))
+            noise = self._rounding * (abs(energy) + self._work_of(load))
             trial_residual = float(np.linalg.norm(self._trial_force))
             share = (energy - lower) / decrease if decrease > 0.0 else -1.0
             if decrease <= 100.0 * noise and lower <= energy + noise and trial_residual < residual:
@@ -132,49 +117,22 @@ class NewtonKrylov:
 
     @property
     def held_bytes(self) -> int:
-        """What each iteration reads of memory, at least: the factor, the blocks, the columns and six vectors."""
-        panel = self._factoring.factor.panel
-        return int(panel.nbytes + self._block.nbytes + self._columns.nbytes + 6 * self.x.nbytes)
+        """What each iteration reads of memory, at least: what the preconditioner does, the blocks and six vectors."""
+        return int(self._base.held_bytes + self._block.nbytes + 6 * self.x.nbytes)
 
     @property
     def moved_bytes(self) -> int:
         """What the iterations so far have read of memory, at least: each reads the factor twice."""
-        return int(self.iterations * (self.held_bytes + self._factoring.factor.panel.nbytes))
-
-    def _hold(self, nodes: np.ndarray) -> None:
-        """Takes ``nodes`` (k,) out of the unknowns."""
-        self._free[:] = ~self.mesh.fixed
-        self._free[nodes] = False
-        held = np.flatnonzero(~self._free & ~self.mesh.fixed)
-        if not np.array_equal(held, self._held):
-            self._held = held
-            self._answers()
-
-    def _answers(self) -> None:
-        """How the mesh answers to unit forces on the held nodes, by the kept factor."""
-        held = self._held
-        self._columns = np.zeros((3 * len(held), *self.x.shape))
-        unit = np.zeros_like(self.x)
-        for k in range(3 * len(held)):
-            unit[held[k // 3], k % 3] = 1.0
-            self._factoring.solve(unit, self._columns[k])
-            unit[held[k // 3], k % 3] = 0.0
-        answer = self._columns[:, held].reshape(3 * len(held), 3 * len(held))
-        self._inverse = np.asarray(np.linalg.inv(0.5 * (answer + answer.T)))
+        return self.iterations * (self.held_bytes + self._base.factor_bytes)
 
     def _update(self) -> None:
         """The stiffness at ``x``, and a new factor where the old one has become slow."""
-        m = self.mesh
         if self._slow:
             self._slow = False
             self._spent = 0
             self.factors += 1
-            for positive_part in (False, True):
-                link_blocks(self.x, m.links, m.rest_length, m.stiffness, positive_part, self._block)
-                if self._factoring.compute(self._block):
-                    break
-            self._answers()
-        link_blocks(self.x, m.links, m.rest_length, m.stiffness, False, self._block)
+            self._base.renew(self.x, self._block)
+        self._base.update(self.x, self._block)
 
     def _predict(self, nodes: np.ndarray, places: Array, load: Array) -> float:
         """Moves the nodes, and all others along the tangent to the path of equilibria if that has less energy."""
@@ -186,7 +144,7 @@ class NewtonKrylov:
             self._evaluate(x, load, self._force)
             self._update()
             multiply(self._block, self.mesh.links, way, self._trial_force)
-            self._trial_force[~self._free] = 0.0
+            _zero(self._base.free, self._trial_force)
             np.subtract(self._force, self._trial_force, out=self._trial_force)
             self._solve(self._trial_force, FIRST_ACCURACY, math.inf)
             trial += self._step
@@ -203,8 +161,8 @@ class NewtonKrylov:
     def _solve(self, force: Array, accuracy: float, radius: float) -> tuple[float, float, bool]:
         """The step from ``x`` into ``_step``: the decrease that it promises, its length, and if the border cut it."""
         decrease, length, cut, iterations = conjugate_gradients(
-            self._block, self.mesh.links, self._free, self._factoring.factor, self._held, self._columns, self._inverse,
-            force, accuracy, radius, self._longest, self._step, self._scratch,
+            self._block, self.mesh.links, self._base.kept, force, accuracy, radius, self._longest, self._step,
+            self._scratch,
         )  # fmt: skip
         self.iterations += iterations
         self._spent += iterations
@@ -216,24 +174,13 @@ class NewtonKrylov:
         m = self.mesh
         force[:] = load
         energy = add_forces(x, m.links, m.rest_length, m.stiffness, 0, len(m.links), force)
-        force[~self._free] = 0.0
+        _zero(self._base.free, force)
         return float(energy - np.vdot(load, x))
 
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _dot(a: Array, b: Array) -> float:
-    u, v = a.reshape(-1), b.reshape(-1)
-    total = 0.0
-    for i in range(len(u)):
-        total += u[i] * v[i]
-    return total
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _add(a: float, source: Array, target: Array) -> None:
-    u, v = source.reshape(-1), target.reshape(-1)
-    for i in range(len(u)):
-        v[i] += a * u[i]
+    def _work_of(self, load: Array) -> float:
+        """The sum of what its terms come to, mN mm, whatever their signs; overwrites ``_way``."""
+        np.multiply(load, self.x, out=self._way)
+        return float(np.sum(np.abs(self._way, out=self._way)))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -244,35 +191,10 @@ def _zero(free: np.ndarray, values: Array) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def precondition(
-    free: np.ndarray,
-    factor: MultifrontalFactor,
-    held: np.ndarray,
-    columns: Array,
-    inverse: Array,
-    s: Scratch,
-) -> None:
-    """``s.z`` = M⁻¹ ``s.r`` with the held nodes at rest; overwrites ``s.q``."""
-    multifrontal.solve(factor, s.r, s.v, s.w, s.z)
-    share = s.q.reshape(-1)
-    for i in range(len(inverse)):
-        share[i] = 0.0
-        for j in range(len(inverse)):
-            share[i] += inverse[i, j] * s.z[held[j // 3], j % 3]
-    for i in range(len(inverse)):
-        _add(-share[i], columns[i], s.z)
-    _zero(free, s.z)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
 def conjugate_gradients(
     block: Array,
     links: np.ndarray,
-    free: np.ndarray,
-    factor: MultifrontalFactor,
-    held: np.ndarray,
-    columns: Array,
-    inverse: Array,
+    kept: Kept,
     force: Array,
     accuracy: float,
     radius: float,
@@ -285,16 +207,17 @@ def conjugate_gradients(
     Without a radius (inf) a direction in which the energy curves down is followed until a node has gone ``longest`` mm.
     Returns (the model's decrease, the step's length in the norm of M, cut short, iterations).
     """
+    n = len(out)
     out[:] = 0.0
     s.r[:] = force
     s.p[:] = 0.0
-    goal = accuracy * accuracy * _dot(s.r, s.r)
+    goal = accuracy * accuracy * dot(s.r, s.r, 0, n)
     rho = 1.0
     decrease = 0.0
     oo = op = pp = 0.0  # products of out and p with M, by recurrence
     for iteration in range(MOST):
-        precondition(free, factor, held, columns, inverse, s)
-        new = _dot(s.r, s.z)
+        precondition(kept, block, links, s.r, s.z)
+        new = dot(s.r, s.z, 0, n)
         if not new > 0.0:
             return decrease, math.sqrt(oo), False, iteration
         beta = new / rho if iteration else 0.0
@@ -305,8 +228,8 @@ def conjugate_gradients(
         pp = new + beta * beta * pp
         rho = new
         multiply(block, links, s.p, s.q)
-        _zero(free, s.q)
-        curvature = _dot(s.p, s.q)
+        _zero(kept.free, s.q)
+        curvature = dot(s.p, s.q, 0, n)
         alpha = rho / curvature if curvature > 0.0 else math.inf
         if not oo + alpha * (2.0 * op + alpha * pp) < radius * radius or curvature <= 0.0:
             if radius < math.inf:
@@ -317,13 +240,13 @@ def conjugate_gradients(
                     largest = max(largest, abs(u[i]))
                 alpha = longest / largest
             decrease += alpha * rho - 0.5 * alpha * alpha * curvature
-            _add(alpha, s.p, out)
+            add_scaled(alpha, s.p, out, 0, n)
             return decrease, math.sqrt(oo + alpha * (2.0 * op + alpha * pp)), True, iteration + 1
         decrease += 0.5 * alpha * rho
         oo += alpha * (2.0 * op + alpha * pp)
         op += alpha * pp
-        _add(alpha, s.p, out)
-        _add(-alpha, s.q, s.r)
-        if _dot(s.r, s.r) <= goal:
+        add_scaled(alpha, s.p, out, 0, n)
+        add_scaled(-alpha, s.q, s.r, 0, n)
+        if dot(s.r, s.r, 0, n) <= goal:
             return decrease, math.sqrt(oo), False, iteration + 1
     return decrease, math.sqrt(oo), False, MOST

@@ -17,6 +17,7 @@ from numba import njit
 
 from trainer.geometry import Array
 from trainer.mechanics.nested_dissection import Fronts
+from trainer.mechanics.substitution import MultifrontalFactor, solve
 
 #: A pivot below this share of the diagonal is lost in rounding: the matrix is singular, or not positive definite.
 SINGULAR = 1e-9
@@ -25,26 +26,27 @@ SINGULAR = 1e-9
 GROUP, PANEL, TILE = 8, 64, 256
 
 
-class MultifrontalFactor(NamedTuple):
-    """L and D of K = L D Lᵀ, front by front; the unknown 3 p + c is component c of the node at position p."""
+class Work(NamedTuple):
+    """What a factorisation overwrites."""
 
-    fronts: Fronts
-    panel_start: np.ndarray  # (fronts + 1,) int64
-    panel: (
-        np.ndarray
-    )  # float32; front s has (3 pivots, 3 (pivots + rows)) of it by rows: Lᵀ, its diagonal and below unset
-    inverse: Array  # (3 f,) 1 / D
+    front: Array  # (largest front²,)
+    stack: Array  # (most numbers that lie on it at once,)
+    waiting: np.ndarray  # (fronts,) int64, the fronts whose update matrices lie on the stack
+    local: np.ndarray  # (f,) int64, the place of a node in the front at hand
+    packed: Array  # (PANEL TILE,) a tile of a panel
+    multiples: Array  # (4 GROUP,)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def eliminate(a: Array, size: int, pivots: int, inverse: Array, diagonal: Array, least: float) -> int:
+def eliminate(
+    a: Array, size: int, pivots: int, inverse: Array, diagonal: Array, least: float, packed: Array, m: Array
+) -> int:
     """Eliminates the first ``pivots`` of the unknowns of a front from ``a``, by rows (size, size), upper half.
 
     Its rows become D Lᵀ and the rest what remains. A pivot below the share ``least`` of ``diagonal`` is replaced by
-    it; returns how often that was done.
+    it; returns how often that was done. ``packed`` (PANEL TILE,) and ``m`` (4 GROUP,) are scratch.
     """
     replaced = 0
-    packed, m = np.zeros(PANEL * TILE), np.zeros(4 * GROUP)
     for low in range(0, pivots, PANEL):
         high = min(low + PANEL, pivots)
         for first in range(low, high, GROUP):
@@ -127,26 +129,20 @@ def _factor(
     blocks: Array,
     links: np.ndarray,
     fronts: Fronts,
-    panel_start: np.ndarray,
     panel: np.ndarray,
     inverse: Array,
-    front: Array,
-    stack: Array,
     diagonal: Array,
-    local: np.ndarray,
     least: float,
+    work: Work,
 ) -> int:
-    """All fronts in turn; ``front``, ``stack`` are scratch. Returns how many pivots were too small."""
-    top = 0
-    replaced = 0
-    count = len(fronts.parent)
-    waiting = np.zeros(count, dtype=np.int64)  # the fronts whose update matrices lie on the stack
-    depth = 0
-    for s in range(count):
+    """All fronts in turn. Returns how many pivots were too small."""
+    stack, waiting, local = work.stack, work.waiting, work.local
+    replaced = top = depth = out = 0
+    for s in range(len(fronts.parent)):
         first, last = fronts.first[s], fronts.first[s + 1]
         rows = fronts.row[fronts.row_start[s] : fronts.row_start[s + 1]]
         pivots, size = 3 * (last - first), 3 * (last - first + len(rows))
-        a = front[: size * size]
+        a = work.front[: size * size]
         a[:] = 0.0
         for p in range(first, last):
             local[p] = 3 * (p - first)
@@ -184,12 +180,16 @@ def _factor(
                         a[to] += stack[of]
                         a[to + 1] += stack[of + 1]
                         a[to + 2] += stack[of + 2]
-        replaced += eliminate(a, size, pivots, inverse[3 * first : 3 * last], diagonal[3 * first : 3 * last], least)
-        out = panel_start[s]
-        for k in range(pivots):
-            d = inverse[3 * first + k]
-            for j in range(k + 1, size):
-                panel[out + k * size + j] = a[k * size + j] * d
+        replaced += eliminate(
+            a, size, pivots, inverse[3 * first : 3 * last], diagonal[3 * first : 3 * last], least, work.packed,
+            work.multiples,
+        )  # fmt: skip
+        for k in range(0, pivots, 3):
+            for i in range(3):
+                d = inverse[3 * first + k + i]
+                for j in range(k + i + 1, size):
+                    panel[out + 3 * (j - k) + i] = a[(k + i) * size + j] * d
+            out += 3 * (size - k)
         width = size - pivots
         for i in range(width):
             stack[top + i * width + i : top + (i + 1) * width] = a[
@@ -220,84 +220,6 @@ def _stack_size(fronts: Fronts) -> int:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _forwards(factor: MultifrontalFactor, v: np.ndarray, w: np.ndarray) -> None:
-    """Overwrites ``v`` (3 f,) float32 with D⁻¹ L⁻¹ v; ``w`` is scratch as long as the longest row of a panel."""
-    fronts = factor.fronts
-    for s in range(len(fronts.parent)):
-        first, last = 3 * fronts.first[s], 3 * fronts.first[s + 1]
-        rows = fronts.row[fronts.row_start[s] : fronts.row_start[s + 1]]
-        pivots = last - first
-        size = pivots + 3 * len(rows)
-        w[:pivots] = v[first:last]
-        w[pivots:size] = np.float32(0.0)
-        for k in range(0, pivots, 3):
-            at = factor.panel_start[s] + k * size
-            l0, l1 = factor.panel[at : at + size], factor.panel[at + size : at + 2 * size]
-            l2 = factor.panel[at + 2 * size : at + 3 * size]
-            a0 = w[k]
-            w[k + 1] -= a0 * l0[k + 1]
-            a1 = w[k + 1]
-            w[k + 2] -= a0 * l0[k + 2] + a1 * l1[k + 2]
-            a2 = w[k + 2]
-            c0, c1, c2, target = l0[k + 3 :], l1[k + 3 :], l2[k + 3 :], w[k + 3 : size]
-            for j in range(size - k - 3):
-                target[j] -= a0 * c0[j] + a1 * c1[j] + a2 * c2[j]
-        v[first:last] = w[:pivots]
-        for k in range(len(rows)):
-            for c in range(3):
-                v[3 * rows[k] + c] += w[pivots + 3 * k + c]
-    for j in range(len(v)):
-        v[j] *= factor.inverse[j]
-
-
-# The sums may be reordered by the compiler, as in banded.substitute_backwards: they do not vectorise otherwise.
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc"})
-def _backwards(factor: MultifrontalFactor, v: np.ndarray, w: np.ndarray) -> None:
-    """Overwrites ``v`` (3 f,) float32 with L⁻ᵀ v; ``w`` as in :func:`_forwards`."""
-    fronts = factor.fronts
-    for s in range(len(fronts.parent) - 1, -1, -1):
-        first, last = 3 * fronts.first[s], 3 * fronts.first[s + 1]
-        rows = fronts.row[fronts.row_start[s] : fronts.row_start[s + 1]]
-        pivots = last - first
-        size = pivots + 3 * len(rows)
-        w[:pivots] = v[first:last]
-        for k in range(len(rows)):
-            for c in range(3):
-                w[pivots + 3 * k + c] = v[3 * rows[k] + c]
-        for k in range(pivots - 3, -1, -3):
-            at = factor.panel_start[s] + k * size
-            l0, l1 = factor.panel[at : at + size], factor.panel[at + size : at + 2 * size]
-            l2 = factor.panel[at + 2 * size : at + 3 * size]
-            c0, c1, c2, known = l0[k + 3 :], l1[k + 3 :], l2[k + 3 :], w[k + 3 : size]
-            s0 = s1 = s2 = np.float32(0.0)
-            for j in range(size - k - 3):
-                s0 += c0[j] * known[j]
-                s1 += c1[j] * known[j]
-                s2 += c2[j] * known[j]
-            w[k + 2] -= s2
-            w[k + 1] -= s1 + l1[k + 2] * w[k + 2]
-            w[k] -= s0 + l0[k + 1] * w[k + 1] + l0[k + 2] * w[k + 2]
-        v[first:last] = w[:pivots]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def solve(factor: MultifrontalFactor, values: Array, v: np.ndarray, w: np.ndarray, out: Array) -> None:
-    """K⁻¹ of the forces ``values`` (n, 3) mN on the factor's nodes into the same rows of ``out`` (n, 3) mm.
-
-    Overwrites ``v`` (3 f,) float32 and ``w`` (longest row of a panel,) float32.
-    """
-    order = factor.fronts.order
-    for p in range(len(order)):
-        for c in range(3):
-            v[3 * p + c] = values[order[p], c]
-    _forwards(factor, v, w)
-    _backwards(factor, v, w)
-    for p in range(len(order)):
-        for c in range(3):
-            out[order[p], c] = v[3 * p + c]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
 def _sum_diagonal(blocks: Array, links: np.ndarray, place: np.ndarray, out: Array) -> None:
     """The diagonal (3 f,) of the whole matrix."""
     out[:] = 0.0
@@ -316,20 +238,19 @@ class Multifrontal:
         """Of a stiffness that the ``links`` (m, 2) add up to on the nodes of ``fronts``."""
         pivots = np.diff(fronts.first)
         sizes = 3 * (pivots + np.diff(fronts.row_start))
-        panel_start = np.concatenate([[0], np.cumsum(3 * pivots * sizes)])
+        numbers = int(np.sum(3 * pivots * sizes - 9 * pivots * (pivots - 1) // 2))
         longest = int(np.max(sizes, initial=0))
         # Σ (size - k)² over the pivots k of each front.
         rest = sizes - 3 * pivots
         self.operations = float(np.sum((sizes.astype(float) ** 3 - rest.astype(float) ** 3) / 3.0))
         f = 3 * len(fronts.order)
         self._links = links
-        self.factor = MultifrontalFactor(
-            fronts, panel_start, np.full(int(panel_start[-1]), 0.0, dtype=np.float32), np.zeros(f)
-        )
-        self._front = np.zeros(longest * longest)
-        self._stack = np.zeros(_stack_size(fronts))
+        self.factor = MultifrontalFactor(fronts, np.zeros(numbers, dtype=np.float32), np.zeros(f))
         self._diagonal = np.zeros(f)
-        self._local = np.zeros(len(fronts.order), dtype=np.int64)
+        self._work = Work(
+            np.zeros(longest * longest), np.zeros(_stack_size(fronts)), np.zeros(len(fronts.parent), dtype=np.int64),
+            np.zeros(len(fronts.order), dtype=np.int64), np.zeros(PANEL * TILE), np.zeros(4 * GROUP),
+        )  # fmt: skip
         self.scratch = (np.zeros(f, dtype=np.float32), np.zeros(longest, dtype=np.float32))  # v, w of solve
 
     def compute(self, blocks: Array) -> bool:
@@ -337,8 +258,7 @@ class Multifrontal:
         f = self.factor
         _sum_diagonal(blocks, self._links, f.fronts.place, self._diagonal)
         replaced = _factor(
-            blocks, self._links, f.fronts, f.panel_start, f.panel, f.inverse, self._front, self._stack,
-            self._diagonal, self._local, SINGULAR,
+            blocks, self._links, f.fronts, f.panel, f.inverse, self._diagonal, SINGULAR, self._work,
         )  # fmt: skip
         return replaced == 0
 

@@ -50,8 +50,8 @@ def dissect(mesh: LinkMesh, leaf: int = LEAF) -> Fronts:
     place = np.full(len(mesh.rest), -1, dtype=np.int32)
     place[order] = np.arange(len(order), dtype=np.int32)
     row_start, row = _rows(order, starts, parent, place, mesh.start, mesh.neighbour)
-    ends = place[mesh.links]
-    earliest = np.where(ends.min(axis=1) >= 0, ends.min(axis=1), ends.max(axis=1))
+    i, j = place[mesh.links[:, 0]], place[mesh.links[:, 1]]
+    earliest = np.where(np.minimum(i, j) >= 0, np.minimum(i, j), np.maximum(i, j))
     front = np.searchsorted(starts, earliest, side="right") - 1
     link = np.argsort(front, kind="stable").astype(np.int32)
     link_start = np.searchsorted(front[link], np.arange(len(starts)))
