@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from volume_files import FORMATS, write_mha, write_nifti, write_nrrd
 
@@ -104,8 +104,9 @@ def test_what_is_written_lies_where_it_was(tmp_path: Path) -> None:
 def test_resampling_keeps_labels_in_place(spacing: float) -> None:
     """Each new voxel has the label of the old voxel in which its centre lies, and the grids cover the same box.
 
-    A centre may lie on an old voxel's face: 1e-6 of a voxel beside it is not looked at. The number of new voxels is
-    rounded, so the box differs by half a new voxel at most.
+    A centre may lie on an old voxel's face: 1e-6 of a voxel beside it is not looked at, nor a spacing where that leaves
+    less than a fifth of all (of 0.8 mm, twice the old, none). The number of new voxels is rounded, so the box differs by
+    half a new voxel at most.
     """
     at = np.indices((24, 24, 24)) * 0.4
     labels = ((at - 4.6) ** 2).sum(axis=0) < 4.0**2
@@ -116,7 +117,7 @@ def test_resampling_keeps_labels_in_place(spacing: float) -> None:
     old = place.inverse().apply(other.lps_from_volume.apply(index * spacing)) / 0.4
     nearest = np.clip(np.round(old), 0, 23).astype(int)
     clear = np.all(np.abs(np.abs(old - nearest) - 0.5) > 1e-6, axis=1)
-    assert clear.mean() > 0.2
+    assume(clear.mean() > 0.2)
     np.testing.assert_array_equal(other.labels.ravel()[clear], ball.labels[tuple(nearest[clear].T)])
     np.testing.assert_allclose(np.array(other.labels.shape) * spacing, 24 * 0.4, atol=0.5 * spacing + 1e-9)
 
