@@ -10,12 +10,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from waiting import PATIENCE_S
+
 from trainer.drivers.minibird_flock import Silences
 from trainer.profile import Profile, load_profile
 
-#: Times faster than real time; the units' silences are shortened less, since a busy machine keeps no short ones.
+#: Times faster than real time; the units' silences are shortened less, since a busy machine keeps no short ones, and an
+#: answer that comes is waited for.
 SPEED = 10.0
-SHORT = Silences(reset_s=0.1, hold_s=0.05, configure_s=0.15, drain_s=0.05, answer_s=1.0)
+SHORT = Silences(reset_s=0.1, hold_s=0.05, configure_s=0.15, drain_s=0.05, answer_s=10.0)
 
 
 @contextmanager
@@ -34,7 +37,7 @@ def simulated(folder: Path, *options: str, profile: str = "minibird-pair", speed
         yield Path(written)
     finally:
         process.terminate()
-        out, err = process.communicate(timeout=30)
+        out, err = process.communicate(timeout=PATIENCE_S)
     assert err == ""
     assert process.returncode == 0
     assert json.loads(out)["transmitter_damaged"] is False

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from waiting import PATIENCE_S
 
 from trainer.drivers.live import LivePoses
 from trainer.poses import ToolPoses
@@ -14,7 +15,6 @@ from trainer.poses import ToolPoses
 TOOLS = ("left", "right")
 HOME = ToolPoses(np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]), np.eye(4)[[0, 0]], np.ones(2), np.ones(2, dtype=bool))
 TICK_HZ = 200.0  # ten times slower than simulated devices, so that a busy machine can follow; the newest pose wins
-PATIENCE_S = 60.0  # on a machine with everything else to do; nothing waits so long on an idle one
 
 
 class Polling:

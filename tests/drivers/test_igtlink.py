@@ -16,8 +16,10 @@ from functools import partial
 import numpy as np
 import pytest
 from live_polling import HOME, TICK_HZ, TOOLS, Polling, all_seen, none_seen
+from waiting import PATIENCE_S
 
 from trainer.config import ConfigError
+from trainer.drivers import in_hand
 from trainer.drivers.connected import Connected
 from trainer.drivers.igtlink import Server
 from trainer.drivers.live import LivePoses
@@ -72,9 +74,11 @@ def opened(port: int, spec: OpenigtlinkSpec | None = None) -> LivePoses:
     return LivePoses(source, spec, spec.device, None, TOOLS, TICK_HZ, HOME)
 
 
-def test_published_poses_are_the_poses_that_are_read() -> None:
+def test_published_poses_are_the_poses_that_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
     """float32 rounds 30 mm by 1e-6 mm (half a step of 2⁻¹⁹), and each of the rotation's entries by 3e-8; a quaternion
-    is no farther off than a few of those."""
+    is no farther off than a few of those. However late a busy machine brings them, none is lost."""
+    monkeypatch.setattr(in_hand, "FIRST_S", PATIENCE_S)
+    monkeypatch.setattr(Connected, "stale_s", PATIENCE_S)
     with publishing() as port:
         polling = Polling(driver := opened(port))
         polling.until(lambda poses: np.array_equal(poses.position[0], POSES.position[0]))
@@ -165,7 +169,8 @@ def test_an_instrument_that_is_not_published_is_lost_alone_and_says_so() -> None
         polling = Polling(driver := opened(port))
         polling.until(lambda poses: poses.valid.tolist() == [True, False])
         driver.close()
-    assert polling.reasons() == "nothing comes of 'RightToWorld'"
+    reasons = {loss["reason"] for loss in polling.summary()["lost"] if loss["tool"] == "right"}
+    assert reasons == {"nothing comes of 'RightToWorld'"}
 
 
 @pytest.mark.parametrize(
@@ -180,9 +185,8 @@ def test_an_instrument_that_is_not_published_is_lost_alone_and_says_so() -> None
 def test_numbers_that_are_no_pose_move_nothing(wrong: Transform, reason: str) -> None:
     with talking(encode(wrong)) as (port, _):
         polling = Polling(driver := opened(port))
-        polling.until(none_seen)
+        polling.until(lambda poses: none_seen(poses) and reason in polling.reasons())
         driver.close()
-    assert reason in polling.reasons()
     np.testing.assert_array_equal(polling.last.position, HOME.position)
 
 

@@ -17,11 +17,12 @@ from typing import Any
 import numpy as np
 import pytest
 import serial
-from live_polling import HOME, PATIENCE_S, TICK_HZ, TOOLS, Polling, all_seen, none_seen
+from live_polling import HOME, TICK_HZ, TOOLS, Polling, all_seen, none_seen
 from simulated_devices import SHORT, SPEED, loaded, simulated
+from waiting import PATIENCE_S
 
 from trainer.config import ConfigError
-from trainer.drivers import sequence_file
+from trainer.drivers import minibird_stream, sequence_file
 from trainer.drivers.closure import OUT_OF_RANGE, SILENT
 from trainer.drivers.minibird import Minibird
 from trainer.drivers.minibird_flock import UNHURRIED, Flock, Silences
@@ -40,6 +41,12 @@ def healthy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Profile]:
     """A pair of birds at rest and a closure board, for the tests that need nothing else."""
     with simulated(tmp_path_factory.mktemp("healthy")) as path:
         yield loaded(path)
+
+
+@pytest.fixture
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine that is busy with something else keeps records back: no bird is silent for that."""
+    monkeypatch.setattr(minibird_stream, "SILENT_S", PATIENCE_S)
 
 
 def spec_of(profile: Profile) -> MinibirdSpec:
@@ -97,6 +104,7 @@ def test_every_position_of_the_real_recording_arrives(tmp_path: Path, speed: flo
         assert np.degrees(twice_sine.max()) <= 0.022
 
 
+@pytest.mark.usefixtures("patient")
 def test_a_session_of_poses_comes_through_and_its_summary_tells(healthy: Profile) -> None:
     driver = opened(healthy)
     polling = Polling(driver)
@@ -160,22 +168,30 @@ def persistent(profile: Profile) -> Minibird:
     raise AssertionError("no conversation in thirty tries")
 
 
-def test_a_power_cycle_and_an_unplugged_cable_are_survived(tmp_path: Path) -> None:
-    """Power is off for 0.8 s of the clock's, the cable is out for 1.5 s (TRAINER_LONG: 5 s): the instruments are lost
-    with the reason, the flock is configured anew, and they are back."""
-    faults = ("power-cycle=3:8", f"unplug=25:{(5 if os.environ.get('TRAINER_LONG') else 1.5) * SPEED:g}")
-    with simulated(tmp_path, *(a for f in faults for a in ("--fault", f))) as path:
-        driver = opened(loaded(path))
+@pytest.mark.parametrize(
+    ("fault", "reasons"),
+    [
+        ("power-cycle=3:8", ("is silent",)),
+        (f"unplug=3:{(5 if os.environ.get('TRAINER_LONG') else 2) * SPEED:g}", ("the port is gone", "no such port")),
+    ],
+)
+def test_a_power_cycle_and_an_unplugged_cable_are_survived(
+    tmp_path: Path, fault: str, reasons: tuple[str, ...]
+) -> None:
+    """Power is off for 0.8 s of the clock's, or the cable is out for 2 s (TRAINER_LONG: 5 s): the instruments are lost
+    with the reason, the flock is configured anew, and they are back. A flock without power gives no answer."""
+    with simulated(tmp_path, "--fault", fault) as path:
+        driver = opened(loaded(path), replace(SHORT, answer_s=1.0))
         polling = Polling(driver)
-        polling.until(all_seen, lambda summary: said(summary, "is silent"))
-        polling.until(all_seen, lambda summary: said(summary, "the port is gone", "no such port"))
+        polling.until(all_seen, lambda summary: said(summary, *reasons))
         driver.close()
-    assert polling.summary()["restarts"] >= 2
+    assert polling.summary()["restarts"] >= 1
 
 
+@pytest.mark.usefixtures("patient")
 def test_a_pause_and_another_hemisphere_freeze_without_a_restart(tmp_path: Path) -> None:
-    """A pause of 0.2 s of the clock and 0.5 s with every position's sign changed."""
-    faults = ("pause=3:2", "hemisphere=8:5")
+    """A pause of 0.2 s of the clock and 2 s with every position's sign changed."""
+    faults = ("pause=3:2", "hemisphere=8:20")
     with simulated(tmp_path, *(a for f in faults for a in ("--fault", f))) as path:
         driver = opened(loaded(path))
         polling = Polling(driver)
@@ -187,7 +203,8 @@ def test_a_pause_and_another_hemisphere_freeze_without_a_restart(tmp_path: Path)
 
 
 def test_a_closure_sensor_that_says_nothing_or_nonsense_freezes_its_jaws(tmp_path: Path) -> None:
-    faults = ("closure:pause=2:4", "closure:out-of-range=8:3", "closure:unplug=13:4")
+    """For a second each: the board of a process that sleeps that long on a busy machine leaves out what it would say."""
+    faults = ("closure:pause=2:10", "closure:out-of-range=14:10", "closure:unplug=26:10")
     with simulated(tmp_path, *(a for f in faults for a in ("--fault", f))) as path:
         driver = opened(loaded(path))
         polling = Polling(driver)

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from simulated_devices import SHORT, loaded, simulated
+from waiting import PATIENCE_S, wait_for
 
 from trainer.calibration import CalibrationError
 from trainer.config import ConfigError
-from trainer.drivers import watch
-from trainer.drivers.minibird_flock import UNHURRIED
+from trainer.drivers import minibird_stream, watch
+from trainer.drivers.minibird_record import Sample
 from trainer.drivers.serial_port import DeviceError
 from trainer.drivers.watch import STILL_MM, Watch
 from trainer.geometry import Array
@@ -26,51 +28,64 @@ def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(watch, "UNHURRIED", SHORT)
 
 
-def test_a_device_at_rest_is_seen_where_it_is(tmp_path: Path) -> None:
+def test_a_device_at_rest_is_seen_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Bird k rests at (300, 50 k, 0) mm, which a word of 36 in / 8192 says within half its step of 0.11 mm; a touch
     is the mean of such words, all alike. Tilted alike, its quaternion is wrong by 2/32768 in a component at the most.
     """
-    with simulated(tmp_path) as path, Watch(loaded(path), keep_s=1.0) as device:
+    monkeypatch.setattr(watch, "STILL_S", 2.0)  # 1 % of what comes in that time will do
+    with simulated(tmp_path) as path, Watch(loaded(path), keep_s=PATIENCE_S) as device:
         position, quaternion = device.touch(2)
+        assert wait_for(lambda: device.arrival().records > 1000)
         arrived, seen = device.arrival(), device.seen()
-        oldest = device.samples(1)[0]
-        newest = device.samples(1)[-1]
     np.testing.assert_allclose(position, [REST_MM, 50.0, 0.0], rtol=0, atol=0.5 * 36 * 25.4 / 8192)
     assert np.linalg.norm(quaternion) == pytest.approx(1.0, abs=1e-12)
-    assert newest.arrived_s - oldest.arrived_s <= 1.0
-    assert arrived.records > 100
+    assert arrived.duration_s < PATIENCE_S
     assert {name: tool for name, (tool, _) in seen.items()} == {"bird1": "right", "bird2": "left"}
     for _, found in seen.values():
-        assert found.seen_percent > 50.0
+        assert found.seen_percent > 0.0
+        assert found.position_mm is not None
         assert found.closure == pytest.approx(0.0, abs=2 / 740)  # the converter's last digit, of 740
     assert device.flaws["good"] > 100
 
 
-def test_what_is_silent_says_why(tmp_path: Path) -> None:
+def test_what_is_silent_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is not connected again while it is looked at, which has words of its own."""
+    monkeypatch.setattr(minibird_stream, "RETRY_S", PATIENCE_S)
     with simulated(tmp_path, "--fault", "mute") as path, Watch(loaded(path), keep_s=1.0) as device:
+        assert wait_for(lambda: bool(device.trouble))
         with pytest.raises(CalibrationError, match="bird 1: bird 1 is silent"):
-            device.poses(1, 0.8)
+            device.poses(1, 0.1)
         assert device.arrival().records == 0
         assert device.seen()["bird1"][1].position_mm is None
 
 
-def test_a_silent_device_forgets_what_it_was_and_counts_what_it_lost(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """At real speed: 0.5 s of 103 Hz, then 0.7 s of silence within the second that is kept: 72 lost, and a bird that
-    is seen 30 % of the time. A busy machine and the beginning may make it a tenth of a second more or less."""
-    monkeypatch.setattr(watch, "UNHURRIED", replace(SHORT, configure_s=UNHURRIED.configure_s))
-    with simulated(tmp_path, "--fault", "pause=0.5:3", speed=1.0) as path, Watch(loaded(path), keep_s=1.0) as device:
-        ends = time.monotonic() + 30.0
-        while len(device.samples(1)) < 40 and time.monotonic() < ends:
-            time.sleep(0.01)
-        while time.monotonic() - device.samples(1)[-1].arrived_s < 0.7:
-            time.sleep(0.01)
+def test_a_silent_device_forgets_what_it_was_and_counts_what_it_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a clock of the test, with one second kept: 103 records a second for half a second, then 0.7 s of silence.
+
+    31 records are younger than a second then, the first of them by 0.7 s and 30 periods: 103 were due since, it included.
+    """
+    now = [0.0]
+    takes: list[Callable[[Sample], None]] = []
+
+    def stream(spec: object, take: Callable[[Sample], None], silences: object) -> SimpleNamespace:
+        takes.append(take)
+        return SimpleNamespace(start=lambda: None, close=lambda: None)
+
+    monkeypatch.setattr(watch, "FlockStream", stream)
+    monkeypatch.setattr(watch, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    profile = load_profile("minibird-pair").profile
+    with Watch(replace(profile, closure=None), keep_s=1.0) as device:
+        for k in range(52):
+            now[0] = (k + 1) / 103.0
+            takes[0](Sample(1, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), now[0], now[0], ""))
+        assert device.arrival().records == 52
+        assert device.arrival().lost == 0
+        now[0] += 0.7
         arrived, seen = device.arrival(), device.seen()
-    assert arrived.duration_s == pytest.approx(1.0, abs=0.1)
-    assert arrived.lost == pytest.approx(72, abs=12)
-    assert arrived.rate_hz == pytest.approx(31.0, abs=12.0)
-    assert seen["bird1"][1].seen_percent == pytest.approx(30.0, abs=12.0)
+    assert arrived.records == 31
+    assert arrived.duration_s == pytest.approx(0.7 + 30 / 103.0)
+    assert arrived.lost == 103 - 31
+    assert seen["bird1"][1].seen_percent == pytest.approx(100.0 * 31 / 103)
 
 
 def still(strayed_mm: float) -> Watch:

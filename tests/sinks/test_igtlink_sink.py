@@ -12,6 +12,8 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
+from waiting import PATIENCE_S
+
 from trainer.geometry import quaternion_from_axis_angle
 from trainer.openigtlink import MessageParser, Transform
 from trainer.poses import ToolPoses
@@ -19,7 +21,6 @@ from trainer.sinks.igtlink import IgtlinkSink, PublishError
 from trainer.sinks.surface import Frame, TickRecord
 
 TURN = quaternion_from_axis_angle([0.0, 0.0, 1.0], 0.5)
-PATIENCE_S = 30.0
 
 
 def no_frame() -> Frame:
