@@ -19,8 +19,8 @@ from trainer.cli.main import keep_kernels, main
 CommandLine = Callable[..., tuple[int, str, str]]
 
 keep_kernels()
-# The first example may compile a kernel, and the machines are shared: no example is timed. A change is judged by the same
-# examples wherever it is tested; ``pytest -m hypothesis --hypothesis-profile searching`` looks for others.
+# The first example may compile a kernel, and the machines are shared: no example is timed. A change is judged by the
+# same examples wherever it is tested; ``pytest -m hypothesis --hypothesis-profile searching`` looks for others.
 untimed = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.register_profile("searching", untimed)
 settings.register_profile("steady", untimed, derandomize=True, database=None)

@@ -104,9 +104,9 @@ def test_what_is_written_lies_where_it_was(tmp_path: Path) -> None:
 def test_resampling_keeps_labels_in_place(spacing: float) -> None:
     """Each new voxel has the label of the old voxel in which its centre lies, and the grids cover the same box.
 
-    A centre may lie on an old voxel's face: 1e-6 of a voxel beside it is not looked at, nor a spacing where that leaves
-    less than a fifth of all (of 0.8 mm, twice the old, none). The number of new voxels is rounded, so the box differs by
-    half a new voxel at most.
+    A centre may lie on an old voxel's face: 1e-6 of a voxel beside it is not looked at, nor a spacing where that
+    leaves less than a fifth of all (of 0.8 mm, twice the old, none). The number of new voxels is rounded, so the box
+    differs by half a new voxel at most.
     """
     at = np.indices((24, 24, 24)) * 0.4
     labels = ((at - 4.6) ** 2).sum(axis=0) < 4.0**2

