@@ -33,7 +33,7 @@ def pytest_collection_finish(session: pytest.Session) -> None:
     Hypothesis also draws the numbers that it finds in modules that are imported by then. Those would be others with
     other tests before, as they are where there are more workers, or fewer.
     """
-    if any(item.get_closest_marker("hypothesis") for item in session.items):
+    if not session.testsfailed and any(item.get_closest_marker("hypothesis") for item in session.items):
         for module in pkgutil.walk_packages(trainer.__path__, "trainer."):
             if not module.name.endswith("__main__"):
                 importlib.import_module(module.name)

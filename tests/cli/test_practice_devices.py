@@ -22,6 +22,7 @@ from trainer import clock, curriculum, drivers
 from trainer.cli.main import main
 from trainer.clock import Realtime
 from trainer.curriculum import Task
+from trainer.drivers import minibird_stream
 from trainer.drivers.minibird import Minibird
 from trainer.drivers.minibird_flock import UNHURRIED
 from trainer.poses import ToolPoses
@@ -97,9 +98,10 @@ def test_the_expert_s_hands_through_bytes_do_what_they_did(
 
 
 def test_a_lost_tracker_freezes_the_needle_in_its_jaws_and_ctrl_c_keeps_all(
-    command_line: CommandLine, task: Path, tmp_path: Path, own_log: Path
+    command_line: CommandLine, task: Path, tmp_path: Path, own_log: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At rest with the needle, 1 s of motion in: the cable is out for 2 s. Then the trainee has had enough."""
+    monkeypatch.setattr(minibird_stream, "RETRY_S", 1.5)  # in which the reason is heard
     with simulated(tmp_path / "devices", "--fault", "unplug=1:2", speed=1.0) as profile:
         # Jaws that the board says are open would let go of the needle, and that is not what is asked here.
         text = profile.read_text().partition("[closure]")[0]

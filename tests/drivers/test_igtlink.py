@@ -19,7 +19,7 @@ from live_polling import HOME, TICK_HZ, TOOLS, Polling, all_seen, none_seen
 from waiting import PATIENCE_S
 
 from trainer.config import ConfigError
-from trainer.drivers import in_hand
+from trainer.drivers import connected, in_hand
 from trainer.drivers.connected import Connected
 from trainer.drivers.igtlink import Server
 from trainer.drivers.live import LivePoses
@@ -150,7 +150,8 @@ def talking(data: bytes) -> Iterator[tuple[int, list[bytes]]]:
             thread.join()
 
 
-def test_a_server_that_goes_and_returns_costs_no_session() -> None:
+def test_a_server_that_goes_and_returns_costs_no_session(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connected, "RETRY_S", 2.0)  # in which the first reason is heard
     with publishing() as port:
         polling = Polling(driver := opened(port))
         polling.until(lambda poses: not np.array_equal(poses.position, HOME.position))

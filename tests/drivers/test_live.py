@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from functools import partial
 
 import numpy as np
 from live_polling import HOME, TICK_HZ, TOOLS, Polling
+from waiting import PATIENCE_S
 
 from trainer.config import ConfigError
 from trainer.drivers.connected import Connected, Connection
@@ -32,19 +34,21 @@ class Flaky:
 
 
 def test_a_file_that_is_missing_for_a_while_does_not_end_the_reconnecting() -> None:
-    tries = 0
+    tries, known = 0, threading.Event()
 
     def connect() -> Connection:
         nonlocal tries
         tries += 1
         if tries == 2:
             raise ConfigError("tool.rom: no such ROM file")
+        assert tries == 1 or known.wait(PATIENCE_S)
         return Flaky(gone=tries == 1)
 
     sensor = Tracked(name="sensor", tool="left")
     driver = LivePoses(partial(Connected, "ndi", connect), Registration(), (sensor,), None, TOOLS, TICK_HZ, HOME)
     polling = Polling(driver)
+    polling.until(lambda poses: "no such ROM file" in polling.reasons())
+    known.set()
     polling.until(lambda poses: driver.summary()["reconnects"] == 1)
     driver.close()
     assert tries == 3
-    assert "no such ROM file" in polling.reasons()

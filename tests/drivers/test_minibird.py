@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import serial
 from live_polling import HOME, TICK_HZ, TOOLS, Polling, all_seen, none_seen
-from simulated_devices import SHORT, SPEED, loaded, simulated
+from simulated_devices import SHORT, loaded, simulated
 from waiting import PATIENCE_S
 
 from trainer.config import ConfigError
@@ -169,17 +169,15 @@ def persistent(profile: Profile) -> Minibird:
 
 
 @pytest.mark.parametrize(
-    ("fault", "reasons"),
-    [
-        ("power-cycle=3:8", ("is silent",)),
-        (f"unplug=3:{(5 if os.environ.get('TRAINER_LONG') else 2) * SPEED:g}", ("the port is gone", "no such port")),
-    ],
+    ("fault", "reasons"), [("power-cycle=3:8", ("is silent",)), ("unplug=3:50", ("the port is gone", "no such port"))]
 )
 def test_a_power_cycle_and_an_unplugged_cable_are_survived(
-    tmp_path: Path, fault: str, reasons: tuple[str, ...]
+    tmp_path: Path, fault: str, reasons: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Power is off for 0.8 s of the clock's, or the cable is out for 2 s (TRAINER_LONG: 5 s): the instruments are lost
-    with the reason, the flock is configured anew, and they are back. A flock without power gives no answer."""
+    """Power is off for 0.8 s of the clock's, or the cable is out for 5 s: the instruments are lost with the reason, the
+    flock is configured anew, and they are back. Each reason lasts for seconds; a flock without power gives no answer.
+    """
+    monkeypatch.setattr(minibird_stream, "RETRY_S", 2.0)
     with simulated(tmp_path, "--fault", fault) as path:
         driver = opened(loaded(path), replace(SHORT, answer_s=1.0))
         polling = Polling(driver)
@@ -340,7 +338,7 @@ def test_a_bird_with_a_port_of_its_own_needs_no_group_mode(tmp_path: Path) -> No
         driver = opened(loaded(path))
         polling = Polling(driver)
         polling.until(all_seen)
-        polling.until(all_seen, lambda summary: summary["restarts"] == 1)
+        polling.until(all_seen, lambda summary: summary["restarts"] >= 1)
         driver.close()
     assert polling.last.closure.tolist() == [1.0, 1.0]
 

@@ -14,7 +14,7 @@ import pytest
 from live_polling import HOME, TICK_HZ, TOOLS, Polling, all_seen, none_seen
 
 from trainer.config import ConfigError
-from trainer.drivers import ndi
+from trainer.drivers import connected, ndi
 from trainer.drivers.connected import Connected
 from trainer.drivers.live import LivePoses
 from trainer.drivers.ndi import UNSEEN, Tracker
@@ -76,7 +76,6 @@ def library(monkeypatch: pytest.MonkeyPatch) -> type[NDITracker]:
     for name in ("sensors", "poses", "fault", "frozen"):  # as the class has them, whatever a test sets
         monkeypatch.setattr(NDITracker, name, getattr(NDITracker, name))
     monkeypatch.setattr(NDITracker, "made", [])
-    monkeypatch.setattr(ndi, "SILENT_S", 0.3)
     return NDITracker
 
 
@@ -117,16 +116,19 @@ def test_a_sensor_out_of_sight_is_lost_alone_and_comes_back(
     polling = Polling(driver := opened())
     moved(polling)
     library.poses = (pose, LEFT)
-    polling.until(lambda poses: poses.valid.tolist() == [True, False])
+    polling.until(lambda poses: poses.valid.tolist() == [True, False] and reason in polling.reasons())
     library.poses = (RIGHT, LEFT)
     polling.until(all_seen)
     driver.close()
-    assert polling.reasons() == reason
 
 
 @pytest.mark.parametrize("fault", ["raises", "freezes"])
-def test_a_tracker_that_goes_is_opened_again(library: type[NDITracker], fault: str) -> None:
-    """Its library raises, or repeats the last frame for ever."""
+def test_a_tracker_that_goes_is_opened_again(
+    library: type[NDITracker], fault: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its library raises, or repeats the last frame for ever. On a busy machine the next one may seem to as well."""
+    monkeypatch.setattr(ndi, "SILENT_S", 0.3)
+    monkeypatch.setattr(connected, "RETRY_S", 2.0)  # in which the reason is heard
     polling = Polling(driver := opened())
     moved(polling)
     [first] = library.made
@@ -135,12 +137,12 @@ def test_a_tracker_that_goes_is_opened_again(library: type[NDITracker], fault: s
     else:
         first.frozen = True
     polling.until(none_seen)
-    polling.until(lambda poses: bool(poses.valid.all()) and len(library.made) == 2)
+    polling.until(lambda poses: bool(poses.valid.all()) and len(library.made) >= 2)
     driver.close()
     assert first.state == "closed"
-    assert driver.summary()["reconnects"] == 1
-    expected = "/dev/ttyUSB7: no reply from the device" if fault == "raises" else "nothing comes of 'port1'"
-    assert expected in polling.reasons()
+    assert driver.summary()["reconnects"] == len(library.made) - 1
+    expected = "no reply from the device" if fault == "raises" else "the tracker has stopped"
+    assert f"/dev/ttyUSB7: {expected}" in polling.reasons()
 
 
 def test_rom_files_lie_beside_the_profile(library: type[NDITracker], tmp_path: Path) -> None:
