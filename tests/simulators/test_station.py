@@ -42,7 +42,7 @@ def test_a_station_without_a_board_sleeps_until_its_next_cycle(tmp_path: Path, m
     station = Station(spec, None, open_hands("", spec), [tmp_path / "flock"], 1.0, Faults(), Faults(), 0)
     waits: list[float] = []
     monkeypatch.setattr(select, "select", lambda lines, out, wrong, seconds: waits.append(seconds))
-    station.run(lambda: len(waits) >= 3)
+    station.run(lambda: len(waits) >= 3 and (max(waits) > 0.0 or len(waits) >= 1000))
     assert math.fsum(waits) > 0.0
     assert max(waits) <= IDLE_S
 
