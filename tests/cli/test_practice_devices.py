@@ -22,7 +22,6 @@ from trainer import clock, curriculum, drivers
 from trainer.cli.main import main
 from trainer.clock import Realtime
 from trainer.curriculum import Task
-from trainer.drivers import minibird_stream
 from trainer.drivers.minibird import Minibird
 from trainer.drivers.minibird_flock import UNHURRIED
 from trainer.poses import ToolPoses
@@ -98,11 +97,10 @@ def test_the_expert_s_hands_through_bytes_do_what_they_did(
 
 
 def test_a_lost_tracker_freezes_the_needle_in_its_jaws_and_ctrl_c_keeps_all(
-    command_line: CommandLine, task: Path, tmp_path: Path, own_log: Path, monkeypatch: pytest.MonkeyPatch
+    command_line: CommandLine, task: Path, tmp_path: Path, own_log: Path
 ) -> None:
-    """At rest with the needle, 1 s of motion in: the cable is out for 2 s. Then the trainee has had enough."""
-    monkeypatch.setattr(minibird_stream, "RETRY_S", 1.5)  # in which the reason is heard
-    with simulated(tmp_path / "devices", "--fault", "unplug=1:2", speed=1.0) as profile:
+    """At rest with the needle, 1 s of motion in: the cable is out for 5 s. Then the trainee has had enough."""
+    with simulated(tmp_path / "devices", "--fault", "unplug=1:5", speed=1.0) as profile:
         # Jaws that the board says are open would let go of the needle, and that is not what is asked here.
         text = profile.read_text().partition("[closure]")[0]
         profile.write_text(text)
@@ -115,7 +113,7 @@ def test_a_lost_tracker_freezes_the_needle_in_its_jaws_and_ctrl_c_keeps_all(
     assert result["outcome"] == "aborted"
     assert result["events"]["tracking_lost"] >= 2
     assert "release" not in result["events"]
-    assert any("the port is gone" in loss["reason"] for loss in result["device"]["lost"])
+    assert any(re.search("the port is gone|no such port", loss["reason"]) for loss in result["device"]["lost"])
     shown = json.loads(command_line("sessions", "show", "last", "--events", "--json")[1])
     lost = [(e["tick"], e["tool"], e["reason"]) for e in shown["event_list"] if e["kind"] == "tracking_lost"]
     first = [(loss["tick"], loss["tool"], loss["reason"].split("; ")[0]) for loss in result["device"]["lost"]]
