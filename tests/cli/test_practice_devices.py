@@ -104,7 +104,7 @@ def test_a_lost_tracker_freezes_the_needle_in_its_jaws_and_ctrl_c_keeps_all(
         # Jaws that the board says are open would let go of the needle, and that is not what is asked here.
         text = profile.read_text().partition("[closure]")[0]
         profile.write_text(text)
-        presses = threading.Thread(target=ctrl_c_when_back, args=(own_log,), daemon=True)
+        presses = threading.Thread(target=ctrl_c_when_back, args=(own_log, tmp_path / "devices" / "flock"), daemon=True)
         presses.start()
         code, out, err = command_line("practice", task, "--device", profile, "--no-record", "--json")
         presses.join()
@@ -124,20 +124,25 @@ def test_a_lost_tracker_freezes_the_needle_in_its_jaws_and_ctrl_c_keeps_all(
     assert code == 0, err
 
 
-def ctrl_c_when_back(log: Path) -> None:
-    """Press it when the log holds two instruments that were lost and are back."""
-    if wait_for(lambda: backs(log) >= 2):
-        os.kill(os.getpid(), signal.SIGINT)
+def ctrl_c_when_back(log: Path, port: Path) -> None:
+    """Press it when the log holds two instruments that are back after their port was gone.
+
+    On a busy machine they may have been lost and back before.
+    """
+    if wait_for(port.exists) and wait_for(lambda: not port.exists()) and wait_for(port.exists):
+        before = backs(log)
+        if wait_for(lambda: backs(log) >= before + 2):
+            os.kill(os.getpid(), signal.SIGINT)
 
 
 def backs(log: Path) -> int:
     if not log.exists():
         return 0
-    with closing(sqlite3.connect(f"file:{log}?mode=ro", uri=True)) as db:
-        try:
+    try:
+        with closing(sqlite3.connect(f"file:{log}?mode=ro", uri=True)) as db:
             return int(db.execute("select count(*) from events where kind = 'tracking_back'").fetchone()[0])
-        except sqlite3.OperationalError:
-            return 0
+    except sqlite3.OperationalError:
+        return 0
 
 
 def test_a_device_that_is_not_there_is_one_line_and_no_session(
