@@ -53,6 +53,19 @@ def test_other_threads_keep_off_the_core_of_the_caller_until_the_end(cores: set[
 
 
 @linux
+def test_a_process_beside_the_caller_keeps_off_its_core_too(cores: set[int]) -> None:
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as other:
+        with own_core(other.pid):
+            mine, theirs = os.sched_getaffinity(0), os.sched_getaffinity(other.pid)
+        assert len(mine) == 1
+        assert theirs == cores - mine
+        assert os.sched_getaffinity(other.pid) == cores
+        other.kill()
+    with own_core(other.pid):  # which is gone
+        assert os.sched_getaffinity(0) == mine
+
+
+@linux
 def test_a_thread_that_was_bound_is_bound_again_and_a_new_one_goes_where_the_caller_may(cores: set[int]) -> None:
     for home in cores:
         with another_thread() as bound, ExitStack() as stack:

@@ -1,10 +1,10 @@
 """A core of its own for the thread that ticks.
 
 Where more threads are busy than cores, a system lets them take turns, and a turn is long: Linux keeps a tick's thread
-waiting for 4 ms while the recorder's or the rerun library's has its core (measured; a nicer thread takes the same
-turn, less often). So in real time all other threads of the process keep off one core, and several processes on one
-machine take different ones. Only Linux lets a process say so; elsewhere, where there is a single core and where every
-core is another session's, nothing is done.
+waiting for 4 ms while another has its core (measured; a nicer thread takes the same turn, less often). So in real time
+all other threads of the process keep off one core, those of the process that writes its recording, too, and several
+sessions on one machine take different ones. Only Linux lets a process say so; elsewhere, where there is a single core
+and where every core is another session's, nothing is done.
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ CLAIM = "trainer: a tick has core"
 
 
 @contextmanager
-def own_core() -> Iterator[None]:
-    """The calling thread has a core to itself, as far as processes that ask here go; threads that exist keep off it.
+def own_core(*beside: int) -> Iterator[None]:
+    """The calling thread has a core to itself, as far as processes that ask here go; threads that exist keep off it,
+    in this process and in those ``beside`` it, by their ids.
 
     A thread that the caller starts meanwhile begins on the same core. In the end each thread may run again where it
     could before, and those that are new where the caller may.
@@ -38,17 +39,17 @@ def own_core() -> Iterator[None]:
         try:
             with suppress(OSError):  # where the system does not let the caller, the others stay where they are
                 os.sched_setaffinity(here, {core})
-                _keep_off(core, before)
+                _keep_off(core, before, beside)
             yield
         finally:
-            for thread in _threads():
+            for thread in _threads(beside):
                 with suppress(OSError):  # it has just ended, or its cores are gone
                     os.sched_setaffinity(thread, before.get(thread, before[here]))
 
 
-def _keep_off(core: int, before: dict[int, set[int]]) -> None:
+def _keep_off(core: int, before: dict[int, set[int]], beside: tuple[int, ...]) -> None:
     """All threads that ``before`` does not know keep off a core; it then knows where they could run until now."""
-    for thread in _threads():
+    for thread in _threads(beside):
         if thread not in before:
             with suppress(OSError):  # it has just ended
                 cores = os.sched_getaffinity(thread)
@@ -57,8 +58,12 @@ def _keep_off(core: int, before: dict[int, set[int]]) -> None:
                 before[thread] = cores
 
 
-def _threads() -> list[int]:
-    return [int(name) for name in os.listdir("/proc/self/task")]
+def _threads(beside: tuple[int, ...]) -> list[int]:
+    found = []
+    for process in (os.getpid(), *beside):
+        with suppress(OSError):  # it has ended
+            found += [int(name) for name in os.listdir(f"/proc/{process}/task")]
+    return found
 
 
 def _take_core() -> tuple[int, socket.socket] | None:

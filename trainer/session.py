@@ -137,8 +137,8 @@ def interruptible() -> Iterator[Callable[[], bool]]:
 
 @contextmanager
 def old_objects_left_alone() -> Iterator[None]:
-    """What exists now is not searched for garbage until the end: a search through all that numba and rerun have made
-    takes 140 ms, and one falls into most sessions."""
+    """What exists now is not searched for garbage until the end: a search through all that numba has made takes 100 ms,
+    and one falls into most sessions."""
     gc.collect()
     gc.freeze()
     try:

@@ -66,7 +66,7 @@ def eye(region: Region, towards: Array) -> tuple[Array, Array]:
 
 
 def pictures(region: Region, scene_from_world: Rigid, towards: Array) -> partial[Mapping[str, np.ndarray]] | None:
-    """What draws a frame's pictures, in any thread: it has a copy of the labels. None for a drawn section."""
+    """What draws a frame's pictures, in any process: it has a copy of the labels. None for a drawn section."""
     if region.flat >= 0:
         return None
     rigid = region.labels.copy()

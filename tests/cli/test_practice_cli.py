@@ -12,7 +12,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -28,6 +27,7 @@ from trainer.cli.warmup import warm_up
 from trainer.clock import Fast
 from trainer.drivers.scripted import ScriptedHands
 from trainer.log import reader, seal
+from trainer.log.repair import repair_command
 from trainer.log.schema import open_log
 from trainer.metrics.registry import score
 from trainer.poses import ToolPoses
@@ -139,6 +139,18 @@ def test_a_person_reads_a_table_and_where_things_are(command_line: CommandLine, 
 def test_without_db_the_log_of_the_environment_is_used(command_line: CommandLine, task: Path, own_log: Path) -> None:
     assert command_line("practice", task, "--fast", "--no-record")[0] == 0
     assert own_log.exists()
+
+
+def test_a_session_without_streams_is_recorded_by_a_process_that_imports_rerun_alone(
+    task: Path, tmp_path: Path
+) -> None:
+    """The file's number is none of the three that the shell has closed; and what is written to them goes nowhere."""
+    rrd = tmp_path / "x.rrd"
+    code = "import sys, trainer.cli.main as m\ntry:\n    m.main()\nfinally:\n    assert 'rerun' not in sys.modules"
+    arguments = ["practice", str(task), "--fast", "--db", str(tmp_path / "log.db"), "--record", str(rrd)]
+    command = ["sh", "-c", 'exec "$@" <&- >&- 2>&-', "sh", sys.executable, "-c", code, *arguments]
+    assert subprocess.run(command, cwd=Path(__file__).parents[2], check=False).returncode == 0
+    assert repair_command(rrd) == ""
 
 
 def test_an_existing_recording_is_not_overwritten(command_line: CommandLine, task: Path, tmp_path: Path) -> None:
@@ -340,21 +352,18 @@ def test_a_recording_that_fails_costs_only_itself(
 def test_pictures_that_a_busy_machine_left_out_are_told(
     command_line: CommandLine, task: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The recorder is stuck at the first of nine pictures, one every 4 ticks, and has room for no other but the last,
-    which is waited for."""
-    monkeypatch.setattr(recording, "FRAMES_WAITING", 1)
-    write, tick, last = RecordingSink._write, RecordingSink.tick, threading.Event()
-
-    def stuck(sink: RecordingSink, moment: Any) -> None:
-        last.wait()
-        write(sink, moment)
+    """The recorder stands still from the first of nine pictures on, one every 4 ticks, and its pipe has no room for it:
+    no other is taken but the last one."""
+    monkeypatch.setattr(recording, "PIPE_BYTES", 1)  # the system makes that a page
+    tick = RecordingSink.tick
 
     def told(sink: RecordingSink, record: TickRecord) -> None:
-        if record.tick == TICKS - 1:
-            last.set()
+        if record.tick == 0:
+            os.kill(sink.pid, signal.SIGSTOP)
         tick(sink, record)
+        if record.tick == TICKS - 1:
+            os.kill(sink.pid, signal.SIGCONT)
 
-    monkeypatch.setattr(RecordingSink, "_write", stuck)
     monkeypatch.setattr(RecordingSink, "tick", told)
     code, out, err = command_line("practice", task, "--db", tmp_path / "log.db", "--json")
     assert code == 0

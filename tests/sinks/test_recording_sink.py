@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import shlex
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +22,11 @@ from stitch_frames import METRICS, TOOLS, frame, header, layout, made_up_events,
 from waiting import wait_for
 
 from trainer import events
+from trainer.log.repair import repair_command
 from trainer.sinks import recording
-from trainer.sinks.recording import NORMAL_STEP, VERTEX_STEP_MM, RecordingError, RecordingSink
+from trainer.sinks.recorder import NICER, NORMAL_STEP, VERTEX_STEP_MM
+from trainer.sinks.recording import RecorderProcess, RecordingSink
+from trainer.sinks.rrd_file import RecordingError
 from trainer.sinks.surface import TickRecord
 
 TICKS = 150
@@ -212,23 +216,22 @@ def test_the_same_session_gives_the_same_recording_and_another_does_not(path: Pa
     assert rrd("compare", "--unordered", path, other).returncode == 1
 
 
-def test_in_real_time_frames_are_dropped_and_events_are_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """While the thread stands still exactly the waiting room's frames are taken; every event still arrives."""
+def test_in_real_time_frames_are_dropped_and_events_are_not(tmp_path: Path) -> None:
+    """While the process stands still, the frames that its pipe holds are taken; every event still arrives."""
     path = tmp_path / "slow.rrd"
     sink = RecordingSink(path, header(), layout(), tick_hz=30.0)
-    go_on = threading.Event()
-    rounded = recording._rounded
-    monkeypatch.setattr(recording, "_rounded", lambda values, step: go_on.wait() and rounded(values, step))
-    frames = 3 * recording.FRAMES_WAITING
+    os.kill(sink.pid, signal.SIGSTOP)
     first = next(records(1))
+    frames = 3 * recording.PIPE_BYTES // sum(v.nbytes for v in first.frame().vertices)
     for k in range(frames):
         slip = events.Slip(k, 0, k / 30.0, "left", target="thread", body="", load_mN=2.0, limit_mN=1.0)
         sink.tick(dataclasses.replace(first, tick=k, time_s=k / 30.0, events=(slip,)))
-    go_on.set()
+    assert sink.waiting > sink.dropped_frames > 0  # the event that came with a frame that was dropped, and one in parts
+    os.kill(sink.pid, signal.SIGCONT)
     sink.close()
-    assert sink.dropped_frames == frames - recording.FRAMES_WAITING
-    assert len(rows(path, "events", "TextLog:text")) == frames
-    assert len(rows(path, "world/vessel/A", "Mesh3D:vertex_positions")) == recording.FRAMES_WAITING
+    assert list(rows(path, "events", "TextLog:text")) == list(range(frames))
+    taken = list(range(frames - sink.dropped_frames))
+    assert list(rows(path, "world/vessel/A", "Mesh3D:vertex_positions")) == taken
 
 
 @pytest.mark.parametrize("name", ["missing/folder/x.rrd", "."])
@@ -240,13 +243,13 @@ def test_a_path_that_cannot_be_written_is_one_clear_line(tmp_path: Path, name: s
 
 
 FULL_DISK = """
-import resource, signal, sys
+import resource, sys
 from pathlib import Path
 from stitch_frames import header, layout, records
 from trainer.sinks.recording import RecordingError, RecordingSink
 
-sink = RecordingSink(Path(sys.argv[1]), header(), layout(), 100.0, realtime=False)
 resource.setrlimit(resource.RLIMIT_FSIZE, (400_000, 400_000))
+sink = RecordingSink(Path(sys.argv[1]), header(), layout(), 100.0, realtime=False)
 ticks = 0
 for record in records(600):
     sink.tick(record)
@@ -257,7 +260,7 @@ except RecordingError as error:
     print(ticks, sink.error is error, error)
 """
 
-KILLED = """
+SESSION = """
 import sys, time
 from pathlib import Path
 from stitch_frames import header, layout, records
@@ -268,9 +271,8 @@ for record in records(1000):
     if record.tick > 650:
         break
     sink.tick(record)
-while sink.waiting:
-    time.sleep(0.01)
-print("ticked", flush=True)
+assert not {"rerun", "rerun_bindings", "pyarrow"} & set(sys.modules)
+print(sink.pid, flush=True)
 time.sleep(600)
 """
 
@@ -286,7 +288,7 @@ def test_a_full_disk_costs_the_recording_and_nothing_else(tmp_path: Path) -> Non
         [sys.executable, "-c", FULL_DISK, str(path)],
         env=child_environment(), capture_output=True, text=True, timeout=120, check=False,
     )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.strip() == f"601 True {path}: cannot write the recording: File too large"
     assert path.stat().st_size == 400_000
     assert rrd("optimize", path, "-o", mended).returncode == 0
@@ -294,44 +296,118 @@ def test_a_full_disk_costs_the_recording_and_nothing_else(tmp_path: Path) -> Non
     assert rows(mended, "world/vessel/A", "Mesh3D:vertex_positions")
 
 
-def test_a_killed_session_leaves_a_file_that_one_command_repairs(tmp_path: Path) -> None:
-    """All up to the last flush is there: they come after 0, 1, 2, 4 and 8 s, so that at tick 650 tick 400 was it."""
-    path, mended = tmp_path / "killed.rrd", tmp_path / "mended.rrd"
+@contextmanager
+def session(path: Path) -> Iterator[tuple[subprocess.Popen[str], int]]:
+    """Another process that has ticked up to 650 and now waits, without rerun; and the one that writes for it."""
     child = subprocess.Popen(
-        [sys.executable, "-c", KILLED, str(path)], env=child_environment(), stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", SESSION, str(path)], env=child_environment(), stdout=subprocess.PIPE, text=True
     )
     try:
         assert child.stdout is not None
-        assert child.stdout.readline() == "ticked\n"
-        wait_until_it_stops_growing(path)
+        yield child, int(child.stdout.readline())
     finally:
-        child.send_signal(signal.SIGKILL)
+        child.kill()
         child.communicate()
+
+
+def test_the_recording_of_a_killed_session_is_whole_up_to_the_last_tick(tmp_path: Path) -> None:
+    path = tmp_path / "killed.rrd"
+    with session(path) as (child, recorder):
+        assert repair_command(path)
+        child.kill()
+        assert wait_for(lambda: repair_command(path) == "")
+        assert wait_for(lambda: has_ended(recorder))
+    assert rrd("verify", path).returncode == 0
+    ticks = list(rows(path, "world/vessel/A", "Mesh3D:vertex_positions"))
+    assert ticks == list(range(0, 651, TICKS_PER_FRAME))
+
+
+def test_where_all_is_killed_one_command_repairs_the_recording(tmp_path: Path) -> None:
+    """All up to the last flush is there: they come after 0, 1, 2, 4 and 8 s, so that at tick 650 tick 400 was it."""
+    path = tmp_path / "killed.rrd"
+    with session(path) as (_, recorder):
+        wait_until_it_stops_growing(path)
+        os.kill(recorder, signal.SIGKILL)
     assert rrd("verify", path).returncode == 1
-    assert rrd("optimize", path, "-o", mended).returncode == 0
-    assert rrd("verify", mended).returncode == 0
-    ticks = list(rows(mended, "world/vessel/A", "Mesh3D:vertex_positions"))
+    ticks = list(rows(repaired(path, repair_command(path)), "world/vessel/A", "Mesh3D:vertex_positions"))
     assert ticks[: 400 // TICKS_PER_FRAME] == list(range(0, 400, TICKS_PER_FRAME))
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="threads of other languages are counted in /proc")
-def test_a_session_leaves_few_threads_of_rerun_behind(tmp_path: Path) -> None:
-    """Disconnected alone, a recording keeps its two threads until the process ends. It also has a blueprint with two,
-    which rerun 0.41 does not let go of. The first session also starts what all share. Threads take their time to end,
-    so they are waited for."""
+@pytest.mark.parametrize("realtime", [False, True])
+def test_a_recorder_that_is_killed_costs_no_tick_and_the_line_says_what_to_do(tmp_path: Path, realtime: bool) -> None:
+    path = tmp_path / "alone.rrd"
+    sink = RecordingSink(path, header(), layout(), HZ, realtime=realtime)
+    for record in records(TICKS):
+        if record.tick == 100:
+            assert sink.error is None
+            os.kill(sink.pid, signal.SIGKILL)
+        sink.tick(record)
+    sink.metrics(METRICS)
+    with pytest.raises(RecordingError) as caught:
+        sink.close()
+    line, _, repair = str(caught.value).partition("; repair what is there with: ")
+    assert line == f"{path}: cannot write the recording: the process that writes it ended by SIGKILL"
+    repaired(path, repair)
+    assert not Path(f"/proc/{sink.pid}").exists()
 
-    def threads() -> int:
-        return len(os.listdir("/proc/self/task"))
 
-    record_to(tmp_path / "first.rrd", records(8), realtime=False)
-    before, sessions = threads(), 6
-    for k in range(sessions):
-        record_to(tmp_path / f"{k}.rrd", records(8), realtime=False)
-    assert wait_for(lambda: threads() <= before + 2 * sessions)
+def test_ctrl_c_is_none_of_the_recorders_business(tmp_path: Path) -> None:
+    """It is in no group that a terminal interrupts, and goes on if the signal reaches it all the same."""
+    path = tmp_path / "interrupted.rrd"
+    sink = RecordingSink(path, header(), layout(), HZ, realtime=False)
+    assert os.getpgid(sink.pid) == sink.pid != os.getpgid(0)
+    # The system weighs nice processes against those of the same session only.
+    assert os.getsid(sink.pid) == os.getsid(0)
+    assert os.getpriority(os.PRIO_PROCESS, sink.pid) == min(19, os.getpriority(os.PRIO_PROCESS, 0) + NICER)
+    for record in records(20):
+        os.kill(sink.pid, signal.SIGINT)
+        sink.tick(record)
+    sink.close()
+    assert rrd("verify", path).returncode == 0
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="what a process has is counted in /proc")
+def test_a_session_leaves_nothing_behind(tmp_path: Path) -> None:
+    """No process, no thread, no open file: of a recording, of one that failed, and of a session that was refused."""
+
+    def there() -> tuple[int, int]:
+        return len(os.listdir("/proc/self/task")), len(os.listdir("/proc/self/fd"))
+
+    before = there()
+    whole = record_to(tmp_path / "whole.rrd", records(8))
+    failed = RecordingSink(tmp_path / "failed.rrd", header(), layout(), HZ)
+    os.kill(failed.pid, signal.SIGKILL)
+    with pytest.raises(RecordingError):
+        failed.close()
+    refused = RecorderProcess()
+    refused.close()
+    gone = RecorderProcess()
+    os.kill(gone.pid, signal.SIGKILL)
+    with pytest.raises(RecordingError, match=r"the process that writes it ended by SIGKILL$"):
+        RecordingSink(tmp_path / "never.rrd", header(), layout(), HZ, recorder=gone)
+    assert there() == before
+    for process in (whole, failed, refused, gone):
+        assert not Path(f"/proc/{process.pid}").exists()
+
+
+def has_ended(process: int) -> bool:
+    """It is gone, or waits for whoever has inherited it to notice."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except OSError:
+        return True
+
+
+def repaired(path: Path, command: str) -> Path:
+    """The file that a command makes which was told to repair ``path``; rerun accepts it."""
+    mended = path.with_suffix(".repaired.rrd")
+    subprocess.run(shlex.split(command), capture_output=True, check=True)
+    assert rrd("verify", mended).returncode == 0
+    return mended
 
 
 def wait_until_it_stops_growing(path: Path) -> None:
-    """What the recording's thread has written is on its way to the file through a pipe, of 64 kB at the most."""
+    """What the recorder has written is on its way to the file through a pipe, of 64 kB at the most."""
     size = -1
     while size != (size := path.stat().st_size):
         time.sleep(1.0)

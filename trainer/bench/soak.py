@@ -6,8 +6,8 @@ session, in which the hands rest after the stitch. Once a second the gauges are 
 
 * memory of this process (resident set), its slope by least squares from the end of the first session on, and in the
   last session after its first twenty seconds;
-* ticks that wait for the log's thread and frames that wait for the recording's; the device has no queue, its newest
-  pose wins;
+* ticks that wait for the log's thread and messages that wait for room in the pipe to the recording's process, which is
+  another one for each session; the device has no queue, its newest pose wins;
 * drift: ticks by which the session's clock and the device's (its samples, counted at the rate it was asked for) have
   come apart since both began. A session on a machine that is too slow for it goes on from where it is, which shows
   here as well.

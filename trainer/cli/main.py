@@ -58,6 +58,7 @@ def _open_closed_streams() -> None:
     for name in ("stdin", "stdout", "stderr"):
         if getattr(sys, name) is None:
             number = os.open(os.devnull, os.O_RDWR)
+            os.set_inheritable(number, True)  # the same goes for processes that we start
             setattr(sys, name, os.fdopen(number, "r" if name == "stdin" else "w"))
 
 

@@ -138,6 +138,12 @@ def perform(
 
 def _open(stack: ExitStack, asked: Asked, clock: Fast) -> _Session:
     """Everything that a session needs, in the order in which it can be refused: the log comes last."""
+    from trainer.sinks.recording import RecorderProcess, RecordingSink
+
+    recorder = None
+    if asked.recording_path is not None:  # it gets ready beside all that follows
+        recorder = stack.enter_context(closing(RecorderProcess()))
+
     from trainer.anatomy import library
     from trainer.choice import choose_tissue, overfull
     from trainer.cli.warmup import announce, warm_up
@@ -149,7 +155,6 @@ def _open(stack: ExitStack, asked: Asked, clock: Fast) -> _Session:
     from trainer.scene import build
     from trainer.sinks.igtlink import IgtlinkSink
     from trainer.sinks.log import LogSink
-    from trainer.sinks.recording import RecordingSink
 
     task = asked.task_file.task
     check_targets(task)
@@ -174,7 +179,9 @@ def _open(stack: ExitStack, asked: Asked, clock: Fast) -> _Session:
     sinks: list[Sink] = []
     recording = None
     if asked.recording_path is not None:
-        recording = RecordingSink(asked.recording_path, header, scene.layout(), task.tick_hz, realtime=clock.realtime)
+        recording = RecordingSink(
+            asked.recording_path, header, scene.layout(), task.tick_hz, realtime=clock.realtime, recorder=recorder
+        )
         sinks.append(stack.enter_context(closing(recording)))
     published = profile.profile.publish
     if published is not None:
@@ -193,7 +200,8 @@ def _run(
     from trainer.session import interruptible, old_objects_left_alone, run
 
     driver, clock, sinks = session.driver, session.clock, session.sinks
-    undisturbed = own_core() if clock.realtime else nullcontext()
+    beside = [] if session.recording is None else [session.recording.pid]
+    undisturbed = own_core(*beside) if clock.realtime else nullcontext()
     with (
         closing(Progress(session.asked.task_file.task)) as progress,
         interruptible() as interrupted,

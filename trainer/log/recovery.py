@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import shlex
-import shutil
 import sys
 import time
 from dataclasses import dataclass
@@ -12,6 +10,7 @@ from pathlib import Path
 
 from sqlite_utils import Database
 
+from trainer.log.repair import repair_command
 from trainer.log.schema import STALE_S, can_write, clear_errors, path_of
 from trainer.log.seal import seal
 
@@ -31,9 +30,9 @@ class Interrupted:
         kept = f"session {self.session} was interrupted: its first {self.duration_s:.2f} s are kept, listed as aborted"
         if self.recording is None or not Path(self.recording).exists():
             return kept
-        good = Path(self.recording).with_suffix(".repaired.rrd")
-        repair = shlex.join([_rerun(), "rrd", "optimize", self.recording, "-o", str(good)])
-        return f"{kept}; its recording lacks its end, repair it with: {repair}"
+        if repair := repair_command(Path(self.recording)):
+            return f"{kept}; its recording lacks its end, repair it with: {repair}"
+        return f"{kept}; its recording ends there"
 
 
 def recover(db: Database) -> list[Interrupted]:
@@ -66,11 +65,6 @@ def abort(db: Database, session_id: str, reason: str, heartbeat: float | None = 
         if closed:
             seal(db, session_id)
     return bool(closed)
-
-
-def _rerun() -> str:
-    """The program that belongs to this Python; its folder need not be on the user's PATH."""
-    return shutil.which("rerun", path=str(Path(sys.executable).parent)) or "rerun"
 
 
 def _alive(pid: int) -> bool:

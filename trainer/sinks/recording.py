@@ -1,76 +1,51 @@
 """The recording that a person looks at: a rerun file with the scene, forces, events and scores.
 
-World coordinates are mm with +z up, on the timelines ``tick`` and ``sim_time``. The tick hands a copy of the
-scene to a thread, at most ``max_hz`` times a second, and the thread writes it; what was measured belongs
-in the log, not here: vertices are rounded for the eye, and in real time a frame is dropped sooner than the
-simulation waits. Events are never dropped. The trainee's name is not in the file.
+At most ``max_hz`` times a second a tick puts a copy of the scene into a pipe, and a process of its own writes it
+(:mod:`trainer.sinks.recorder`): there rerun's Python code holds up no tick. What was measured belongs in the log, not
+here: in real time a frame is dropped sooner than the simulation waits. Events are never dropped.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import datetime
 import math
-import queue
-import threading
-import tomllib
+import os
+import pickle
+import signal
+import subprocess
+import sys
+from collections import deque
+from collections.abc import Callable
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-import numpy as np
-import rerun as rr
-import rerun_bindings
-
-from trainer.events import (
-    Break,
-    Drop,
-    Event,
-    Grasp,
-    Overforce,
-    Release,
-    Slip,
-    StepDone,
-    TaskDone,
-    TaskStarted,
-    Tear,
-    TickOverrun,
-    TrackingLost,
-)
+from trainer.events import Event, TaskDone
 from trainer.geometry import Array
 from trainer.log.record import Metric, SessionHeader
-from trainer.sinks.blueprint import blueprint
-from trainer.sinks.normals import vertex_normals
-from trainer.sinks.rrd_file import RecordingError, RrdFile
+from trainer.log.repair import repair_command
+from trainer.sinks.rrd_file import RecordingError
 from trainer.sinks.surface import Frame, Layout, TickRecord
 
-#: Step to which vertices are rounded, mm (0.24 µm). A power of two clears the low bits of a float32, which is
-#: what lets LZ4 shrink them; the step is a twentieth of a pixel where 5 mm fill 1000 pixels.
-VERTEX_STEP_MM = 2.0**-12
-#: Step to which normals are rounded: 0.2 degrees, invisible in shading.
-NORMAL_STEP = 2.0**-8
-#: A killed process loses the pictures of at most so much simulated time, s; in the beginning of half the session. Of
-#: each flush rerun keeps some 60 kB for the file's footer: one every second adds 4 MB a minute (measured).
-FLUSH_S = 5.0
-#: Frames that may wait for the thread: half a second at 30 Hz.
-FRAMES_WAITING = 15
-
-STEEL = (176, 184, 192, 255)
-NEEDLE = (226, 230, 235, 255)
-THREAD = (58, 130, 246, 255)
-LEVELS: dict[type[Event], str] = {
-    Break: "ERROR",
-    Tear: "ERROR",
-    Slip: "WARN",
-    Drop: "WARN",
-    Overforce: "WARN",
-    TrackingLost: "WARN",
-    TickOverrun: "WARN",
-}
+#: Bytes that may wait in the pipe: as much as Linux gives to everybody, ten or more frames.
+PIPE_BYTES = 1 << 20
+#: What the process answers when it is ready for the first moment.
+READY = b"ready\n"
 
 
 @dataclass(frozen=True)
-class _Moment:
-    """What passes from the tick to the thread."""
+class Beginning:
+    """What the process is told first."""
+
+    path: Path
+    header: SessionHeader
+    layout: Layout
+    tick_hz: float
+
+
+@dataclass(frozen=True)
+class Moment:
+    """What passes from a tick to the process."""
 
     tick: int
     time_s: float
@@ -79,12 +54,107 @@ class _Moment:
     closure: Array  # (k,)
 
 
+#: What passes through the pipe, None at the end: where the pipe ends without it, the session was killed.
+Message = Beginning | Moment | tuple[Metric, ...] | None
+
+
+class RecorderProcess:
+    """The process that writes one recording; started ahead, it imports what it needs while a scene is built.
+
+    Ctrl-C does not reach it. However the session's process ends, the pipe ends then, and the file is finished.
+    """
+
+    def __init__(self) -> None:
+        # The same modules as here, wherever they lie.
+        code = f"import sys; sys.path[:] = {sys.path!r}; from trainer.sinks.recorder import main; main()"
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", code],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            bufsize=0,
+            env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
+            process_group=0,  # what Ctrl-C reaches; in a session of its own Linux would pass over that it is nice
+        )
+        assert self._process.stdin is not None and self._process.stdout is not None
+        self._pipe, self._answers = self._process.stdin, self._process.stdout
+        self._path: Path | None = None  # of the recording, once it has begun
+        self._waiting: deque[memoryview] = deque()
+        self.pid = self._process.pid
+        if sys.platform == "linux":
+            import fcntl
+
+            with suppress(OSError):  # a system may allow less
+                fcntl.fcntl(self._pipe, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
+
+    @property
+    def waiting(self) -> int:
+        """How many messages the pipe has not taken yet."""
+        return len(self._waiting)
+
+    def begin(self, beginning: Beginning, realtime: bool) -> None:
+        """Wait until the file is begun; from then on, in ``realtime``, :meth:`send` does not wait for the pipe.
+
+        Raises RecordingError.
+        """
+        self._path = beginning.path
+        self.send(beginning)
+        answer = self._answers.readline()
+        if answer != READY:
+            raise self._failure(answer)
+        os.set_blocking(self._pipe.fileno(), not realtime)
+
+    def send(self, *messages: Message) -> None:
+        """Give to the pipe what it takes of what waits and of ``messages``; the rest waits for the next call.
+
+        Raises RecordingError when the process has ended.
+        """
+        self._waiting.extend(memoryview(pickle.dumps(message, pickle.HIGHEST_PROTOCOL)) for message in messages)
+        while self._waiting:
+            try:
+                taken = os.write(self._pipe.fileno(), self._waiting[0])
+            except BlockingIOError:
+                return
+            except BrokenPipeError:
+                raise self._failure() from None
+            self._waiting[0] = self._waiting[0][taken:]
+            if not self._waiting[0]:
+                self._waiting.popleft()
+
+    def finish(self) -> None:
+        """Wait until the file is whole. Raises RecordingError."""
+        os.set_blocking(self._pipe.fileno(), True)
+        self.send(None)
+        answer = self._answers.read()
+        if answer or self._process.wait():
+            raise self._failure(answer)
+
+    def close(self) -> None:
+        """Wait until nothing is left of the process; one that has not begun has nothing to finish, and is ended."""
+        self._pipe.close()
+        if self._path is None:
+            self._process.kill()
+        self._process.wait()
+        self._answers.close()
+
+    def _failure(self, answer: bytes = b"") -> RecordingError:
+        """Why the process has ended: what it said, ``answer`` first, or what ended it."""
+        assert self._path is not None
+        said = (answer + self._answers.read()).decode()
+        code = self._process.wait()
+        by = f"by {signal.Signals(-code).name}" if code < 0 else f"with code {code}"
+        ended = f"the process that writes it ended {by}"
+        if self._path.exists() and self._path.stat().st_size:
+            ended += f"; repair what is there with: {repair_command(self._path)}"
+        return RecordingError(self._path, said or ended)
+
+
 class RecordingSink:
     """Writes ``path`` (.rrd). Raises RecordingError when the file cannot be made.
 
     A failure during the session is kept in ``error`` and raised by :meth:`close`; ``tick`` never fails.
-    With ``realtime`` a frame is dropped (and counted in ``dropped_frames``) when the thread is behind;
-    without it the tick waits, so that the same session gives the same recording.
+    With ``realtime`` a frame is dropped (and counted in ``dropped_frames``) when the process is so far behind that the
+    pipe is full; without it the tick waits, so that the same session gives the same recording. ``recorder`` is one that
+    was started ahead, for this recording alone.
     """
 
     def __init__(
@@ -95,261 +165,63 @@ class RecordingSink:
         tick_hz: float,
         max_hz: float = 30.0,
         realtime: bool = True,
+        recorder: RecorderProcess | None = None,
     ) -> None:
         self.path = Path(path)
         self.dropped_frames = 0
-        self._failure: RecordingError | None = None
-        self._header = header
-        self._layout = layout
-        self._realtime = realtime
+        self.error: RecordingError | None = None
         self._ticks_per_frame = max(1, math.ceil(tick_hz / max_hz - 1e-9))
-        self._tick_hz = tick_hz
         self._next_frame = 0
-        self._draw = layout.pictures is not None
-        self._next_flush = 0
-        self._last = (0, 0.0)
-        self._steps = [str(step["name"]) for step in tomllib.loads(header.task_toml).get("step", [])]
-
-        # Memory and threads of an earlier session's recording go when rerun is told so, as by rr.init(); those of its
-        # blueprint stay, 2 threads and 1.5 MB a session.
-        rerun_bindings.flush_and_cleanup_orphaned_recordings()
-        # Chunks end where the session's own clock says (see _write), not the machine's: the same session gives
-        # the same chunks, and `rerun rrd compare` finds two recordings equal.
-        self._stream = rr.RecordingStream(
-            "trainer",
-            recording_id=header.id,
-            send_properties=True,
-            batcher_config=rr.ChunkBatcherConfig(flush_tick=datetime.timedelta(days=1)),
-        )
-        self._stream.set_log_time_enabled(False)
-        self._file = RrdFile(self.path, self._stream, blueprint(layout))
-        self._log_header()
-        self._log_layout()
-
-        self._free = threading.Semaphore(FRAMES_WAITING)
-        self._queue: queue.SimpleQueue[_Moment | tuple[Metric, ...] | None] = queue.SimpleQueue()
-        self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
-        self._thread.start()
+        try:
+            open(self.path, "wb").close()
+        except OSError as error:
+            raise RecordingError(self.path, error) from None
+        self._recorder = recorder or RecorderProcess()
+        self.pid = self._recorder.pid
+        with ExitStack() as stack:
+            stack.callback(self._recorder.close)
+            self._recorder.begin(Beginning(self.path, header, layout, tick_hz), realtime)
+            stack.pop_all()
 
     @property
     def waiting(self) -> int:
-        """How many moments are not written yet."""
-        return self._queue.qsize()
-
-    @property
-    def error(self) -> RecordingError | None:
-        """Why the recording is incomplete, or None."""
-        return self._failure or self._file.error
+        """How many moments the pipe has not taken yet."""
+        return self._recorder.waiting
 
     def tick(self, record: TickRecord) -> None:
         """Take the events, and the frame when one is due; the last tick's frame is always due."""
+        self._send()
         if self.error is not None:
             return
         frame = None
         last = any(isinstance(event, TaskDone) for event in record.events)
         if record.tick >= self._next_frame or last:
             self._next_frame = record.tick + self._ticks_per_frame
-            if self._free.acquire(blocking=last or not self._realtime):
+            if last or not self.waiting:
                 frame = record.frame()
             else:
                 self.dropped_frames += 1
         if frame is not None or record.events:
-            closure = record.poses.closure.copy()
-            self._queue.put(_Moment(record.tick, record.time_s, record.events, frame, closure))
+            self._send(Moment(record.tick, record.time_s, record.events, frame, record.poses.closure))
 
     def metrics(self, metrics: tuple[Metric, ...]) -> None:
         """The scores, after the last tick: a scalar each, and a document with all of them."""
-        self._queue.put(metrics)
+        self._send(metrics)
 
     def close(self) -> None:
         """Finish the file. Raises RecordingError when it is incomplete."""
-        self._queue.put(None)
-        self._thread.join()
-        self._stream.disconnect()
-        self._file.close()
+        with closing(self._recorder):
+            self._try(self._recorder.finish)
         if self.error is not None:
             raise self.error
 
-    def _run(self) -> None:
-        while (item := self._queue.get()) is not None:
+    def _send(self, *messages: Message) -> None:
+        self._try(partial(self._recorder.send, *messages))
+
+    def _try(self, action: Callable[[], None]) -> None:
+        """Do it, unless the recording has failed already; if it fails now, keep why."""
+        if self.error is None:
             try:
-                if self.error is None:
-                    if isinstance(item, _Moment):
-                        self._write(item)
-                    else:
-                        self._log_metrics(item)
-            except Exception as error:  # of whatever kind: the session goes on without its recording
-                self._failure = RecordingError(self.path, error)
-            finally:
-                if isinstance(item, _Moment) and item.frame is not None:
-                    self._free.release()
-
-    def _write(self, moment: _Moment) -> None:
-        if moment.tick >= self._next_flush:
-            self._stream.flush()
-            self._next_flush = moment.tick + round(self._tick_hz * min(FLUSH_S, max(1.0, moment.time_s)))
-        for event in moment.events:
-            self._set_time(event.tick, event.time_s)
-            self._log_event(event)
-            # They cost as much as many frames: one drawing for each step of the task, one at the end.
-            self._draw |= isinstance(event, StepDone | TaskDone)
-        self._last = (moment.tick, moment.time_s)
-        if moment.frame is not None:
-            self._set_time(*self._last)
-            self._log_frame(moment.frame)
-            if self._draw and self._layout.pictures is not None:
-                self._draw = False
-                for name, picture in self._layout.pictures(moment.frame).items():
-                    self._stream.log(f"pictures/{name}", rr.Image(picture))
-            for tool, closure in zip(self._header.tools, moment.closure, strict=True):
-                self._stream.log(f"closure/{tool}", rr.Scalars(closure))
-
-    def _set_time(self, tick: int, time_s: float) -> None:
-        self._stream.set_time("tick", sequence=tick)
-        self._stream.set_time("sim_time", duration=time_s)
-
-    def _log_header(self) -> None:
-        header = self._header
-        started = datetime.datetime.fromisoformat(header.started_at)
-        self._stream.send_recording_name(f"{header.task} {header.started_at}")
-        self._stream.send_recording_start_time_nanos(int(started.timestamp()) * 1_000_000_000)
-        self._stream.send_property(
-            "session",
-            rr.AnyValues(
-                id=header.id,
-                task=header.task,
-                task_sha256=header.task_sha256,
-                device=header.device,
-                device_sha256=header.device_sha256,
-                seed=header.seed,
-                tick_hz=header.tick_hz,
-                units="mm, s, mN",
-                versions=[f"{name} {version}" for name, version in sorted(header.versions.items())],
-            ),
-        )
-
-    def _log_layout(self) -> None:
-        """All that does not change. A static vertex position would shadow every later one: none here."""
-        log = self._stream.log
-        layout = self._layout
-        log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        for surface in layout.surfaces:
-            if surface.fixed is None:
-                mesh = rr.Mesh3D.from_fields(triangle_indices=surface.triangles, albedo_factor=surface.rgba)
-            else:
-                mesh = rr.Mesh3D(
-                    vertex_positions=surface.fixed,
-                    triangle_indices=surface.triangles,
-                    vertex_normals=_normals(surface.fixed, surface.triangles),
-                    albedo_factor=surface.rgba,
-                )
-            log(f"world/{surface.name}", mesh, static=True)
-        for part in layout.parts:
-            mesh = rr.Mesh3D(
-                vertex_positions=part.vertices,
-                triangle_indices=part.triangles,
-                vertex_normals=_normals(part.vertices, part.triangles),
-                albedo_factor=STEEL,
-            )
-            log(f"world/instruments/{part.name}", mesh, static=True)
-        for cloud in layout.clouds:
-            if cloud.fixed is not None:
-                balls = rr.Points3D(cloud.fixed, radii=cloud.radius_mm, colors=cloud.rgba)
-            else:
-                balls = rr.Points3D.from_fields(radii=cloud.radius_mm, colors=cloud.rgba)
-            log(f"world/{cloud.name}", balls, static=True)
-        if layout.needle is not None:
-            needle = rr.LineStrips3D([layout.needle], radii=layout.needle_radius_mm, colors=NEEDLE)
-            log("world/needle", needle, static=True)
-        thread = rr.LineStrips3D.from_fields(radii=layout.thread_radius_mm, colors=THREAD)
-        log("world/thread", thread, static=True)
-        log("force/tissue", rr.SeriesLines(names="instruments on tissue", colors=(240, 120, 110)), static=True)
-        log("force/thread", rr.SeriesLines(names="tension of the thread", colors=THREAD), static=True)
-        for tool in self._header.tools:
-            log(f"closure/{tool}", rr.SeriesLines(names=tool), static=True)
-
-    def _log_frame(self, frame: Frame) -> None:
-        log = self._stream.log
-        surfaces = [surface for surface in self._layout.surfaces if surface.fixed is None]
-        for surface, vertices in zip(surfaces, frame.vertices, strict=True):
-            mesh = rr.Mesh3D.from_fields(
-                vertex_positions=_rounded(vertices, VERTEX_STEP_MM),
-                vertex_normals=_rounded(_normals(vertices, surface.triangles), NORMAL_STEP),
-            )
-            log(f"world/{surface.name}", mesh)
-        moving = [cloud for cloud in self._layout.clouds if cloud.fixed is None]
-        for cloud, points in zip(moving, frame.clouds, strict=True):
-            log(f"world/{cloud.name}", rr.Points3D.from_fields(positions=_rounded(points, VERTEX_STEP_MM)))
-        for k, part in enumerate(self._layout.parts):
-            log(f"world/instruments/{part.name}", _transform(frame.part_position[k], frame.part_quaternion[k]))
-        if frame.needle_position is not None and frame.needle_quaternion is not None:
-            log("world/needle", _transform(frame.needle_position, frame.needle_quaternion))
-        pieces = [_rounded(piece, VERTEX_STEP_MM) for piece in frame.thread]
-        log("world/thread", rr.LineStrips3D.from_fields(strips=pieces))
-        log("force/tissue", rr.Scalars(frame.force_mN))
-        log("force/thread", rr.Scalars(frame.tension_mN))
-
-    def _log_event(self, event: Event) -> None:
-        log = self._stream.log
-        log("events", rr.TextLog(_sentence(event), level=LEVELS.get(type(event), "INFO")))
-        match event:
-            case TaskStarted() if self._steps:
-                log("state/step", rr.StateChange(state=self._steps[0]))
-            case StepDone(index=index) if index + 1 < len(self._steps):
-                log("state/step", rr.StateChange(state=self._steps[index + 1]))
-            case TaskDone(outcome=outcome):
-                log("state/step", rr.StateChange(state=outcome))
-            case Grasp(tool=tool, target=target):
-                log(f"state/{tool}", rr.StateChange(state=target))
-            case Release(tool=tool) | Slip(tool=tool):
-                log(f"state/{tool}", rr.StateChange(state=[]))  # a gap in the lane; `rrd verify` refuses null
-
-    def _log_metrics(self, metrics: tuple[Metric, ...]) -> None:
-        self._set_time(*self._last)
-        for metric in metrics:
-            if metric.value is not None:
-                self._stream.log(f"metrics/{metric.name}", rr.Scalars(metric.value))
-        document = rr.TextDocument(_scores(metrics), media_type=rr.MediaType.MARKDOWN)
-        self._stream.log("scores", document, static=True)
-
-
-def _normals(vertices: Array, triangles: np.ndarray) -> Array:
-    normals = np.zeros_like(vertices)
-    vertex_normals(vertices, triangles, normals)
-    return normals
-
-
-def _rounded(values: Array, step: float) -> np.ndarray:
-    """``values`` as float32 multiples of ``step``, a power of two (exact below 2^24 steps: 4 m for vertices)."""
-    return np.asarray(np.rint(values / step) * step, dtype=np.float32)
-
-
-def _transform(position: Array, quaternion: Array) -> rr.Transform3D:
-    return rr.Transform3D.from_fields(translation=position, quaternion=rr.Quaternion(xyzw=np.roll(quaternion, -1)))
-
-
-def _sentence(event: Event) -> str:
-    """The event in one line: kind, tool, then its own fields."""
-    shared = {field.name for field in dataclasses.fields(Event)}
-    own = [f.name for f in dataclasses.fields(event) if f.name not in shared]
-    values = {name: _short(getattr(event, name)) for name in own}
-    fields = [f"{name}={value}" for name, value in values.items() if value]
-    return " ".join([event.kind, *([event.tool] if event.tool else []), *fields])
-
-
-def _short(value: object) -> str:
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    if isinstance(value, tuple):
-        return f"({', '.join(map(_short, value))})"
-    return str(value)
-
-
-def _scores(metrics: tuple[Metric, ...]) -> str:
-    """A Markdown table of the metrics with their target bands and sources."""
-    rows = ["| measure | value | unit | target | source |", "|---|---:|---|---|---|"]
-    for m in metrics:
-        value = "–" if m.value is None else f"{m.value:.3g}"
-        bounds = ["" if b is None else f"{b:g}" for b in (m.target_low, m.target_high)]
-        rows.append(f"| {m.name} | {value} | {m.unit} | {' … '.join(bounds) if any(bounds) else ''} | {m.source} |")
-    return "\n".join(rows)
+                action()
+            except RecordingError as error:
+                self.error = error

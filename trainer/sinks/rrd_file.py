@@ -24,8 +24,9 @@ _BYTES_AT_ONCE = 1 << 16
 class RecordingError(OSError):
     """The recording cannot be written; the text is one line. The session itself is not affected."""
 
-    def __init__(self, path: Path, reason: Exception) -> None:
-        super().__init__(f"{path}: cannot write the recording: {getattr(reason, 'strerror', None) or reason}")
+    def __init__(self, path: Path, reason: Exception | str) -> None:
+        self.reason = str(getattr(reason, "strerror", None) or reason)
+        super().__init__(f"{path}: cannot write the recording: {self.reason}")
 
 
 class RrdFile:

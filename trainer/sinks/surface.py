@@ -56,7 +56,8 @@ class Layout:
     needle_radius_mm: float
     thread_radius_mm: float
     clouds: tuple[Cloud, ...] = ()
-    #: Draws pictures (height, width, 3) uint8 of a frame, by name, in any thread; None where there is nothing to draw.
+    #: Draws pictures (height, width, 3) uint8 of a frame, by name, in any process: it can be pickled; None where there
+    #: is nothing to draw.
     pictures: Callable[[Frame], Mapping[str, np.ndarray]] | None = None
     #: Where the eye is and what it looks at, mm: on a stitch from above and the near side, as through a microscope.
     eye_mm: tuple[float, float, float] = (1.4, -4.8, 3.9)
@@ -65,7 +66,7 @@ class Layout:
 
 @dataclass(frozen=True)
 class Frame:
-    """A copy of the scene at one tick, safe to hand to another thread."""
+    """A copy of the scene at one tick, safe to hand to another thread or process."""
 
     vertices: tuple[Array, ...]  # per surface that is not fixed, (v, 3) mm, world
     part_position: Array  # (p, 3) mm, world_from_part
