@@ -73,7 +73,7 @@ class RecorderProcess:
             stdout=subprocess.PIPE,
             bufsize=0,
             env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
-            process_group=0,  # what Ctrl-C reaches; in a session of its own Linux would pass over that it is nice
+            process_group=0,  # Ctrl-C is not for it; in another session (setsid) Linux would not see that it is nice
         )
         assert self._process.stdin is not None and self._process.stdout is not None
         self._pipe, self._answers = self._process.stdin, self._process.stdout
