@@ -4,8 +4,9 @@ A tracker pair and a closure sensor are played byte for byte on pseudo-terminals
 scripted expert did. For half of the time the stitch is sewn again and again, a session each; the second half is one
 session, in which the hands rest after the stitch. Once a second the gauges are read:
 
-* memory of this process (resident set), its slope by least squares from the end of the first session on, and in the
-  last session after its first twenty seconds;
+* memory of this process and of the one that writes the session's recording (resident sets, which count what they share
+  twice), its slope by least squares from the end of the first session on, and in the last session after its first
+  twenty seconds;
 * ticks that wait for the log's thread and messages that wait for room in the pipe to the recording's process, which is
   another one for each session; the device has no queue, its newest pose wins;
 * drift: ticks by which the session's clock and the device's (its samples, counted at the rate it was asked for) have
@@ -26,7 +27,7 @@ import sys
 import time
 from array import array
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -49,6 +50,14 @@ class Queued(Protocol):
 
     @property
     def waiting(self) -> int: ...
+
+
+@runtime_checkable
+class Helped(Protocol):
+    """A sink with a process of its own."""
+
+    @property
+    def pid(self) -> int: ...
 
 
 @dataclass
@@ -92,6 +101,7 @@ class Gauges:
         soak.begin()
         self._soak, self._driver, self._tell = soak, driver, tell
         self._queues = {type(sink).__name__: sink for sink in sinks if isinstance(sink, Queued)}
+        self._processes = [os.getpid(), *(sink.pid for sink in sinks if isinstance(sink, Helped))]
         self._session = soak.sessions[-1]
         self._due_s = time.monotonic()
         self._apart = -math.inf  # session's clock less the device's in this second, ticks: that of the least late tick
@@ -113,7 +123,7 @@ class Gauges:
         self._due_s = now + EVERY_S
         soak = self._soak
         soak.at_s.append(soak.elapsed_s())
-        soak.rss_mb.append(rss_mb())
+        soak.rss_mb.append(rss_mb(self._processes))
         soak.session_of.append(len(soak.sessions) - 1)
         self._drift()
         if now - soak.told_s >= TOLD_EVERY_S:
@@ -195,11 +205,14 @@ def played(folder: Path, motion: str) -> Iterator[Path]:
         process.communicate()
 
 
-def rss_mb() -> float:
-    """What this process holds in memory, MB; its most so far where the system tells no more."""
-    statm = Path("/proc/self/statm")
-    if statm.exists():
-        return int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+def rss_mb(processes: Sequence[int]) -> float:
+    """What they hold in memory together, MB; of this process alone, and its most so far, where no more is told."""
+    if Path("/proc/self/statm").exists():
+        pages = 0
+        for process in processes:
+            with suppress(OSError):  # it has ended
+                pages += int(Path(f"/proc/{process}/statm").read_text().split()[1])
+        return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
     import resource
 
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3)
