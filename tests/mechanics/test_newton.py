@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from allocations import kept_bytes
+from allocations import ARRAY_HEADER, kept_bytes
 
 from trainer.geometry import Array
 from trainer.mechanics.krylov import NewtonKrylov
@@ -210,12 +210,12 @@ def test_a_frame_of_newton_krylov_allocates_nothing() -> None:
             assert method.move(node, place, tolerance_mN=1e-3).converged
 
     kept, most = kept_bytes(out_and_back)
-    assert kept < 112
+    assert kept < ARRAY_HEADER
     assert most < mesh.rest.nbytes
 
 
 def test_without_compilation_the_same_answer(tmp_path: Path) -> None:
-    """The compiler may reorder one sum (multifrontal), which steers the iterations; all end at the same residual.
+    """The compiler may reorder one sum (substitution), which steers the iterations; all end at the same residual.
 
     It leaves a node within 1e-10 mN over the softest stiffness, 0.1 mN/mm and more here.
     """

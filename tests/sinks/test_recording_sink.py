@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import os
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -326,7 +327,7 @@ def test_where_all_is_killed_one_command_repairs_the_recording(tmp_path: Path) -
     """All up to the last flush is there: they come after 0, 1, 2, 4 and 8 s, so that at tick 650 tick 400 was it."""
     path = tmp_path / "killed.rrd"
     with session(path) as (_, recorder):
-        wait_until_it_stops_growing(path)
+        wait_until_it_holds(400 - TICKS_PER_FRAME, path)
         os.kill(recorder, signal.SIGKILL)
     assert rrd("verify", path).returncode == 1
     ticks = list(rows(repaired(path, repair_command(path)), "world/vessel/A", "Mesh3D:vertex_positions"))
@@ -349,6 +350,43 @@ def test_a_recorder_that_is_killed_costs_no_tick_and_the_line_says_what_to_do(tm
     assert line == f"{path}: cannot write the recording: the process that writes it ended by SIGKILL"
     repaired(path, repair)
     assert not Path(f"/proc/{sink.pid}").exists()
+
+
+class OutOfMemory:
+    """What raises an error without a text where it is read."""
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return exec, ("raise MemoryError",)
+
+
+def test_a_failure_that_says_nothing_is_a_failure(tmp_path: Path) -> None:
+    recorder = RecorderProcess()
+    sink = RecordingSink(tmp_path / "x.rrd", header(), layout(), HZ, realtime=False, recorder=recorder)
+    recorder.send(OutOfMemory())  # type: ignore[arg-type]
+    with pytest.raises(RecordingError, match=r"cannot write the recording: MemoryError$"):
+        sink.close()
+
+
+def test_a_message_that_was_interrupted_is_not_sent_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A second Ctrl-C may come when the pipe has taken a part of one: the file ends before it, and that is told."""
+    path = tmp_path / "x.rrd"
+    sink = RecordingSink(path, header(), layout(), HZ, realtime=False)
+    first, second = itertools.islice(records(10), 2)
+    sink.tick(first)
+
+    def half(pipe: int, message: memoryview, write: Callable[[int, memoryview], int] = os.write) -> int:
+        write(pipe, message[: len(message) // 2])
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(recording.os, "write", half)
+        with pytest.raises(KeyboardInterrupt):
+            sink.tick(dataclasses.replace(first, tick=TICKS_PER_FRAME, events=second.events))
+    with pytest.raises(RecordingError, match=r"cannot write the recording: it was interrupted; its end is missing$"):
+        sink.close()
+    assert wait_for(lambda: has_ended(sink.pid))
+    assert rrd("verify", path).returncode == 0
+    assert list(rows(path, "world/vessel/A", "Mesh3D:vertex_positions")) == [0]
 
 
 def test_ctrl_c_is_none_of_the_recorders_business(tmp_path: Path) -> None:
@@ -406,8 +444,12 @@ def repaired(path: Path, command: str) -> Path:
     return mended
 
 
-def wait_until_it_stops_growing(path: Path) -> None:
-    """What the recorder has written is on its way to the file through a pipe, of 64 kB at the most."""
-    size = -1
-    while size != (size := path.stat().st_size):
-        time.sleep(1.0)
+def wait_until_it_holds(tick: int, path: Path) -> None:
+    """What the recorder has written is on its way to the file through a pipe."""
+    copy = path.with_suffix(".copy.rrd")
+
+    def there() -> bool:
+        shutil.copy(path, copy)
+        return tick in rows(repaired(copy, repair_command(copy)), "world/vessel/A", "Mesh3D:vertex_positions")
+
+    assert wait_for(there)

@@ -106,19 +106,20 @@ def _touched(device: Watch | None, sensor: Sensor, places: Array, keep: Path) ->
     from trainer.drivers.pose_table import QUATERNION
 
     assert device is not None
-    with keep.open("x", encoding="utf-8", newline="\n") as file:
-        file.write(",".join((*READING, *QUATERNION, *KNOWN)) + "\n")
-    typer.echo(f"trainer: readings are kept in {keep}", err=True)
+    keep.touch(exist_ok=False)
     position: list[Array] = []
     quaternion: list[Array] = []
     try:
+        with keep.open("w", encoding="utf-8", newline="\n") as file:
+            file.write(",".join((*READING, *QUATERNION, *KNOWN)) + "\n")
+        typer.echo(f"trainer: readings are kept in {keep}", err=True)
         for k, place in enumerate(places.tolist(), 1):
             where = ", ".join(f"{v:g}" for v in place)
             p, q = _touch(device, sensor, f"{k} of {len(places)}: {sensor.name} to ({where}) mm")
-            position.append(p)
-            quaternion.append(q)
             with keep.open("a", encoding="utf-8", newline="\n") as file:
                 file.write(",".join(repr(float(v)) for v in (*p, *q, *place)) + "\n")
+            position.append(p)
+            quaternion.append(q)
     finally:
         if not position:  # given up before the first one
             keep.unlink()

@@ -89,10 +89,9 @@ def write(records: Iterable[SessionRecord], folder: Path) -> dict[str, int]:
     make_room(folder)
     rows = dict.fromkeys(FILES, 0)
     with ExitStack() as stack:
-        writers = {}
+        files = {name: stack.enter_context(new_file(folder / name)) for name in FILES}
+        writers = {name: csv.writer(file, lineterminator="\n") for name, file in files.items()}
         for name, (columns, _) in FILES.items():
-            file = stack.enter_context(new_file(folder / name))
-            writers[name] = csv.writer(file, lineterminator="\n")
             writers[name].writerow(columns)
         for record in records:
             for name, (_, rows_of) in FILES.items():
@@ -100,4 +99,7 @@ def write(records: Iterable[SessionRecord], folder: Path) -> dict[str, int]:
                     for row in rows_of(record):
                         writers[name].writerow(plain(row))
                         rows[name] += 1
+        for name, file in files.items():  # the disk may be full for one when another is closed
+            with naming(folder / name):
+                file.flush()
     return rows

@@ -14,6 +14,10 @@ from trainer.log.repair import repair_command
 from trainer.log.schema import STALE_S, can_write, clear_errors, path_of
 from trainer.log.seal import seal
 
+#: The process that writes a recording finishes it within this time after its session was killed, s (assumed; a tenth
+#: is usual).
+FINISHING_S = 3.0
+
 INTERRUPTED = "the program stopped before the exercise ended"
 
 
@@ -50,6 +54,7 @@ def recover(db: Database) -> list[Interrupted]:
                 continue
             if abort(db, row["id"], INTERRUPTED, heartbeat=row["heartbeat"]):
                 kept = next(db.query("select ticks, duration_s from sessions where id = ?", [row["id"]]))
+                _let_finish(row["recording"], row["heartbeat"] + FINISHING_S)
                 found.append(Interrupted(row["id"], kept["ticks"], kept["duration_s"], row["recording"]))
     return found
 
@@ -65,6 +70,12 @@ def abort(db: Database, session_id: str, reason: str, heartbeat: float | None = 
         if closed:
             seal(db, session_id)
     return bool(closed)
+
+
+def _let_finish(recording: str | None, until_s: float) -> None:
+    """Wait for a recording to be whole, as it may be until that time."""
+    while recording is not None and time.time() < until_s and repair_command(Path(recording)):
+        time.sleep(0.05)
 
 
 def _alive(pid: int) -> bool:

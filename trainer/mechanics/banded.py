@@ -140,7 +140,7 @@ def substitute_forwards(columns: np.ndarray, unit: np.ndarray, inverse: Array, v
         v[j] *= inverse[j]
 
 
-# The one kernel whose sums the compiler may reorder: they do not vectorise otherwise, and the factor would have to be
+# The compiler may reorder these sums: they do not vectorise otherwise, and the factor would have to be
 # kept by rows as well. The order is fixed when it is compiled, so results are still the same bits in every run.
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc"})
 def substitute_backwards(columns: np.ndarray, unit: np.ndarray, v: np.ndarray) -> None:

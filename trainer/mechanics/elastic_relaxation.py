@@ -56,7 +56,7 @@ def _pull(law, other, alone, d, c, apart, h, area):  # type: ignore[no-untyped-d
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def answer(u, links, labels, material_of, shape, strides, box, c, law, h, area, rest, part, still, before, last, now):  # type: ignore[no-untyped-def]
-    """A sweep of component ``c`` for any laws and materials; like :func:`smooth`, but asks each link.
+    """A sweep of component ``c`` for any laws and materials; like ``linear_sweeps``, but asks each link.
 
     ``rest`` (m, 3, 3) is the stiffness at rest and ``part`` (m,) how much of the way an element goes.
     """
@@ -103,7 +103,7 @@ def answer(u, links, labels, material_of, shape, strides, box, c, law, h, area, 
 
 
 def relax(volume: Volume, state: VolumeState, duration_s: float) -> int:
-    """Let the volume relax for ``duration_s``; returns the number of sweeps. Nothing awake, nothing done."""
+    """Let the volume relax for ``duration_s``; returns the number of sweeps that were due. Nothing awake, none."""
     if not (duration_s >= 0.0 and math.isfinite(duration_s)):
         raise ValueError(f"relaxation was asked to last {duration_s} s; expected at least 0")
     step_s = min(m.time_constant_s for m in volume.materials) / SWEEPS

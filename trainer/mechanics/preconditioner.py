@@ -84,7 +84,7 @@ class Preconditioner:
     @property
     def operations(self) -> float:
         """Multiplications that a new factor of the whole takes, for each number in it."""
-        return self._whole.operations / len(self._whole.factor.panel)
+        return self._whole.operations / max(1, len(self._whole.factor.panel))
 
     def hold(self, nodes: np.ndarray) -> None:
         """Takes ``nodes`` (k,) out of the unknowns."""
@@ -113,6 +113,7 @@ class Preconditioner:
             link_blocks(x, m.links, m.rest_length, m.stiffness, True, block)
             if not self._near.compute(block):
                 self._near.factor.inverse[:] = 0.0  # B⁻¹ = 0: the factor of the whole alone
+                self._near.factor.panel[:] = np.float32(0.0)
             link_blocks(x, m.links, m.rest_length, m.stiffness, False, block)
 
     def _find_near(self) -> None:

@@ -4,7 +4,7 @@ Every solve reads the whole factor twice and computes two operations for each nu
 it reads. So the factor lies in the order in which it is read, as one stream: front by front, node by node, and of each
 node the rows below it with its three columns side by side. Forwards it is read upwards throughout and backwards
 downwards throughout, the innermost loop too: streams as short as a front are not foreseen by the processor, and take
-three times as long (measured).
+two and a half times as long (measured at 20 000 nodes).
 """
 
 from __future__ import annotations

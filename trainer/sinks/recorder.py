@@ -45,7 +45,7 @@ from trainer.log.record import Metric
 from trainer.sinks.blueprint import blueprint
 from trainer.sinks.normals import vertex_normals
 from trainer.sinks.recording import READY, Beginning, Message, Moment
-from trainer.sinks.rrd_file import RecordingError, RrdFile
+from trainer.sinks.rrd_file import RrdFile
 from trainer.sinks.surface import Frame
 
 #: The session's threads come first where they share a core with this process: ten to one. Assumed.
@@ -77,29 +77,34 @@ LEVELS: dict[type[Event], str] = {
 def main() -> None:
     """Write one recording, from the standard input."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the session, whose end comes through the pipe
-    os.nice(NICER)
     answers = os.dup(sys.stdout.fileno())
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what a library prints is no answer
+    code = 0
+    with suppress(BrokenPipeError):  # a session that was killed hears no answer
+        try:
+            _record(_messages(sys.stdin.buffer), answers)
+        except Exception as error:  # of whatever kind: the session goes on without its recording
+            code = 1
+            os.write(answers, (getattr(error, "reason", "") or str(error) or type(error).__name__).encode())
+    os._exit(code)  # all is written and closed; to take the modules apart takes another half second
+
+
+def _record(messages: Iterator[Message], answers: int) -> None:
+    os.nice(NICER)
     _normals(np.zeros((1, 3)), np.zeros((1, 3), dtype=np.int32))  # to load the kernel takes half a second
-    messages = _messages(sys.stdin.buffer)
     beginning = next(messages, None)
     if not isinstance(beginning, Beginning):  # the session was refused
         return
-    with suppress(BrokenPipeError):  # a session that was killed hears no answer
-        try:
-            with closing(Recorder(beginning)) as recorder:
-                os.write(answers, READY)
-                for message in messages:
-                    recorder.write(message)
-        except Exception as error:  # of whatever kind: the session goes on without its recording
-            failure = error if isinstance(error, RecordingError) else RecordingError(beginning.path, error)
-            os.write(answers, failure.reason.encode())
-    os._exit(0)  # all is written and closed; to take the modules apart takes another half second
+    with closing(Recorder(beginning)) as recorder:
+        os.write(answers, READY)
+        for message in messages:
+            recorder.write(message)
 
 
 def _messages(source: BinaryIO) -> Iterator[Message]:
-    """Until the session says that it is over, or the pipe ends, be it within a message."""
-    with suppress(EOFError, pickle.UnpicklingError):
+    """Until the session says that it is over, or the pipe ends. Raises UnpicklingError where it ends within a message:
+    who is left to hear it has lost the rest."""
+    with suppress(EOFError):
         while (message := pickle.load(source)) is not None:
             yield message
 

@@ -77,7 +77,8 @@ class RecorderProcess:
         )
         assert self._process.stdin is not None and self._process.stdout is not None
         self._pipe, self._answers = self._process.stdin, self._process.stdout
-        self._path: Path | None = None  # of the recording, once it has begun
+        self._path: Path | None = None  # of the recording, once it is to begin
+        self._begun = False
         self._waiting: deque[memoryview] = deque()
         self.pid = self._process.pid
         if sys.platform == "linux":
@@ -101,6 +102,7 @@ class RecorderProcess:
         answer = self._answers.readline()
         if answer != READY:
             raise self._failure(answer)
+        self._begun = True
         os.set_blocking(self._pipe.fileno(), not realtime)
 
     def send(self, *messages: Message) -> None:
@@ -116,12 +118,19 @@ class RecorderProcess:
                 return
             except BrokenPipeError:
                 raise self._failure() from None
+            except KeyboardInterrupt:  # nobody knows how much of it was taken: what follows would be read as its rest
+                self._waiting.clear()
+                self._pipe.close()
+                raise
             self._waiting[0] = self._waiting[0][taken:]
             if not self._waiting[0]:
                 self._waiting.popleft()
 
     def finish(self) -> None:
         """Wait until the file is whole. Raises RecordingError."""
+        assert self._path is not None
+        if self._pipe.closed:
+            raise RecordingError(self._path, "it was interrupted; its end is missing")
         os.set_blocking(self._pipe.fileno(), True)
         self.send(None)
         answer = self._answers.read()
@@ -131,20 +140,27 @@ class RecorderProcess:
     def close(self) -> None:
         """Wait until nothing is left of the process; one that has not begun has nothing to finish, and is ended."""
         self._pipe.close()
-        if self._path is None:
+        if not self._begun:
             self._process.kill()
-        self._process.wait()
-        self._answers.close()
+        try:
+            self._process.wait()
+        except KeyboardInterrupt:  # whoever waits has lost patience with it
+            self._process.kill()
+            self._process.wait()
+            raise
+        finally:
+            self._answers.close()
 
     def _failure(self, answer: bytes = b"") -> RecordingError:
         """Why the process has ended: what it said, ``answer`` first, or what ended it."""
         assert self._path is not None
         said = (answer + self._answers.read()).decode()
         code = self._process.wait()
-        by = f"by {signal.Signals(-code).name}" if code < 0 else f"with code {code}"
+        known = -code in {*signal.Signals}
+        by = f"by {signal.Signals(-code).name}" if known else f"with code {code}"
         ended = f"the process that writes it ended {by}"
-        if self._path.exists() and self._path.stat().st_size:
-            ended += f"; repair what is there with: {repair_command(self._path)}"
+        if self._path.exists() and self._path.stat().st_size and (repair := repair_command(self._path)):
+            ended += f"; repair what is there with: {repair}"
         return RecordingError(self._path, said or ended)
 
 

@@ -25,7 +25,7 @@ class RecordingError(OSError):
     """The recording cannot be written; the text is one line. The session itself is not affected."""
 
     def __init__(self, path: Path, reason: Exception | str) -> None:
-        self.reason = str(getattr(reason, "strerror", None) or reason)
+        self.reason = str(getattr(reason, "strerror", None) or reason) or type(reason).__name__
         super().__init__(f"{path}: cannot write the recording: {self.reason}")
 
 
