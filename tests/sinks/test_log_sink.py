@@ -401,6 +401,9 @@ def test_a_full_disk_is_told_in_one_line_and_costs_nothing_written(tmp_path: Pat
     try:
         process = in_subprocess(FILLS_THE_DISK, str(disk / "s.db"), SESSION, "disk")
         process.wait()
+        with open_log(disk / "s.db") as db:
+            assert recover(db) == []
+            assert [s.id for s in reader.list_sessions(db)] == [SESSION]
         (disk / "ballast").unlink()  # room for all that waits in the write-ahead file, a second time
         assert_told_and_kept(disk / "s.db", process, "the disk is full")
     finally:

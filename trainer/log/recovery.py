@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sqlite3
 import sys
 import time
 from dataclasses import dataclass
@@ -42,7 +43,7 @@ class Interrupted:
 def recover(db: Database) -> list[Interrupted]:
     """Close and seal the sessions that say they are running while nobody writes them. Raises LogError.
 
-    A log that may not be changed is left as it is.
+    A log that may not be changed, or cannot be as the disk is full, is left as it is: it can be read all the same.
     """
     if not can_write(path_of(db)):
         return []
@@ -52,7 +53,13 @@ def recover(db: Database) -> list[Interrupted]:
         for row in list(db.query(query)):
             if _alive(row["pid"]) and time.time() - row["heartbeat"] < STALE_S:
                 continue
-            if abort(db, row["id"], INTERRUPTED, heartbeat=row["heartbeat"]):
+            try:
+                closed = abort(db, row["id"], INTERRUPTED, heartbeat=row["heartbeat"])
+            except sqlite3.OperationalError as error:
+                if not error.sqlite_errorname.startswith("SQLITE_FULL"):
+                    raise
+                break
+            if closed:
                 kept = next(db.query("select ticks, duration_s from sessions where id = ?", [row["id"]]))
                 _let_finish(row["recording"], row["heartbeat"] + FINISHING_S)
                 found.append(Interrupted(row["id"], kept["ticks"], kept["duration_s"], row["recording"]))
