@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import math
 import sys
 from collections.abc import Callable
 
 import numpy as np
 import pytest
+from conftest import CommandLine
 from scipy.integrate import solve_ivp
 
 from trainer.bench import peers, thread
 from trainer.bench.hard_thread import cases
+from trainer.bench.rows import Row
 from trainer.geometry import Array
 from trainer.mechanics.thread_rod import RodModel
 
@@ -84,6 +87,22 @@ def test_peers_that_are_missing_are_said_to_be(monkeypatch: pytest.MonkeyPatch) 
         "not measured: elastica is not installed",
     ]
     assert {r.method for r in rows if r.frames} == {"rod", "chain"}
+
+
+def test_the_command_prints_what_was_measured_and_what_is_missing(
+    monkeypatch: pytest.MonkeyPatch, command_line: CommandLine
+) -> None:
+    rows = [Row(peers.CASE, 50, "chain", "-", 9, 0.02, 0.03, 1e-5, "reference", 0.0, "converged", "length")]
+    missing = peers.MISSING.format("mujoco")
+    nan = float("nan")
+    rows.append(Row(peers.CASE, 50, "mujoco", "-", 0, nan, nan, nan, missing, nan, missing))
+    monkeypatch.setattr(peers, "measure", lambda: rows)
+    code, out, _ = command_line("bench", "peers", "--json")
+    assert code == 0
+    assert [(r["method"], r["median_ms"]) for r in json.loads(out)["rows"]] == [("chain", 0.02), ("mujoco", None)]
+    code, out, _ = command_line("bench", "peers")
+    assert code == 0
+    assert missing in out
 
 
 @pytest.mark.parametrize(("case", "method", "run"), cases(), ids=lambda value: value if isinstance(value, str) else "")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,6 +14,7 @@ from trainer.cli.sessions import JsonOption
 
 if TYPE_CHECKING:
     from trainer.bench.realtime import Perform
+    from trainer.bench.rows import Row
     from trainer.bench.soak import Observed
     from trainer.bench.soak import Perform as Practised
     from trainer.clock import Realtime
@@ -113,7 +114,6 @@ def speed_error(
     """Time against error of every method of mechanics; writes speed_error.md, .svg and .json."""
     from trainer.bench import page
     from trainer.bench.machine import load
-    from trainer.cli.sessions import print_table
     from trainer.cli.warmup import announce
 
     folder = _folder(out, quick)
@@ -126,16 +126,47 @@ def speed_error(
         print(json.dumps(page.document(rows, about, quick), indent=2, allow_nan=False))
     else:
         for name, of_subject in rows.items():
-            print_table(
-                ("case", page.SUBJECTS[name].counts, "method", "setting", "median ms", "p90 ms", "error", "status"),
-                [
-                    (r.case, str(r.size), r.method, r.setting, page.ms(r.median_ms), page.ms(r.p90_ms),
-                     f"{r.error:.1e}", r.status)
-                    for r in of_subject
-                ],
-            )  # fmt: skip
+            _print_rows(page.SUBJECTS[name].counts, of_subject)
     for path in written:
         typer.echo(f"written: {path}", err=True)
+
+
+def _print_rows(counts: str, rows: Sequence[Row]) -> None:
+    from trainer.bench import page
+    from trainer.cli.sessions import print_table
+
+    print_table(
+        ("case", counts, "method", "setting", "median ms", "p90 ms", "error", "status"),
+        [
+            (
+                r.case,
+                str(r.size),
+                r.method,
+                r.setting,
+                page.ms(r.median_ms),
+                page.ms(r.p90_ms),
+                f"{r.error:.1e}",
+                r.status,
+            )
+            for r in rows
+        ],
+    )
+
+
+@app.command("peers")
+def swing_beside_peers(as_json: JsonOption = False) -> None:
+    """A swinging chain of 50 links, here and in MuJoCo and PyElastica, where they are installed beside."""
+    from dataclasses import asdict
+
+    from trainer.bench import page, peers
+
+    about = _machine()
+    rows = peers.measure()
+    if as_json:
+        plain = [{k: None if v != v else v for k, v in asdict(row).items()} for row in rows]  # NaN where not measured
+        print(json.dumps({"rows": plain, "machine": about}, indent=2, allow_nan=False))
+        return
+    _print_rows(page.SUBJECTS["thread"].counts, rows)
 
 
 @app.command()
