@@ -329,6 +329,24 @@ def test_a_running_session_is_left_alone_until_its_heart_has_stopped(path: Path)
         assert [i.session for i in recover(db)] == [SESSION]
 
 
+def test_an_interrupted_session_is_left_as_it_is_where_the_disk_is_full(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def abort(*_: object, **__: object) -> bool:
+        full = sqlite3.OperationalError("database or disk is full")
+        full.sqlite_errorname = "SQLITE_FULL"
+        raise full
+
+    with closing(LogSink(path, header(SESSION))) as sink, open_log(path) as db:
+        sink.record("completed", 0, 0.0)
+        execute(path, "update sessions set heartbeat = heartbeat - ?", (STALE_S + 1.0,))
+        with monkeypatch.context() as patched:
+            patched.setattr("trainer.log.recovery.abort", abort)
+            assert recover(db) == []
+        assert [s.id for s in reader.list_sessions(db)] == [SESSION]
+        assert [i.session for i in recover(db)] == [SESSION]
+
+
 def test_the_heart_beats_without_ticks(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Compiling kernels may take longer than a heart may stop."""
     monkeypatch.setattr(log, "BEAT_S", 0.0)
@@ -401,9 +419,6 @@ def test_a_full_disk_is_told_in_one_line_and_costs_nothing_written(tmp_path: Pat
     try:
         process = in_subprocess(FILLS_THE_DISK, str(disk / "s.db"), SESSION, "disk")
         process.wait()
-        with open_log(disk / "s.db") as db:
-            assert recover(db) == []
-            assert [s.id for s in reader.list_sessions(db)] == [SESSION]
         (disk / "ballast").unlink()  # room for all that waits in the write-ahead file, a second time
         assert_told_and_kept(disk / "s.db", process, "the disk is full")
     finally:
