@@ -201,7 +201,7 @@ class Scene:
             farthest = max(farthest, math.dist(a.position, b.position))
             held = self.world.jaws[i].tool_from_needle
             if held is not None:
-                farthest = max(farthest, math.dist((a @ held).position, (b @ held).position))
+                farthest = max(farthest, math.dist(a.apply(held.position), b.apply(held.position)))
         region = self.world.region
         stride = STRIDE_MM if region is None else STRIDE_VOXELS * min(region.volume.spacing_mm)
         return min(MOST_MOVEMENTS, max(1, math.ceil(farthest / stride)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import math
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -96,11 +97,11 @@ def admit(seen: ToolPoses, held: ToolPoses) -> ToolPoses:
     A pose is finite and its quaternion of length 1 within 1e-6, and a closure lies between 0 and 1, which is what the
     sinks and the scene rely on; a closure beyond is cut off.
     """
-    pose = np.isfinite(seen.position).all(axis=1) & np.isfinite(seen.closure)
-    with np.errstate(invalid="ignore", over="ignore"):
-        pose &= np.abs(np.sum(seen.quaternion**2, axis=1) - 1.0) < 2e-6
-    if pose.all() and np.all((seen.closure >= 0.0) & (seen.closure <= 1.0)):
+    rows = zip(seen.position.tolist(), seen.quaternion.tolist(), seen.closure.tolist(), strict=True)
+    are_poses = [_is_pose(*row) for row in rows]
+    if all(are_poses) and all(0.0 <= closure <= 1.0 for closure in seen.closure.tolist()):
         return seen
+    pose = np.array(are_poses, dtype=np.bool_)
     return ToolPoses(
         position=np.where(pose[:, None], seen.position, held.position),
         quaternion=np.where(pose[:, None], seen.quaternion, held.quaternion),
@@ -108,6 +109,12 @@ def admit(seen: ToolPoses, held: ToolPoses) -> ToolPoses:
         valid=seen.valid & pose,
         reason=tuple(seen.why_lost(i) or ("" if is_pose else NO_POSE) for i, is_pose in enumerate(pose)),
     )
+
+
+def _is_pose(position: list[float], quaternion: list[float], closure: float) -> bool:
+    """By scalars: a tick begins with this, when nothing of numpy is in the caches."""
+    norm = sum(q * q for q in quaternion)  # of what is no number, or too large, no number below
+    return all(map(math.isfinite, (*position, closure))) and abs(norm - 1.0) < 2e-6
 
 
 def _overrun(tick: int, events: tuple[Event, ...], work_ms: float, skipped_s: float, clock: Fast) -> TickOverrun:

@@ -102,16 +102,16 @@ def _on_thread(
 ) -> list[tuple[Hole, float]]:
     """Pull of a taut thread on each hole of a run: tension times the sum of its ways outside the channel."""
     found = []
+    place, channel = rows.position.tolist(), cable.channel.tolist()
     for row in range(first + 1, last):
         hole = rows.hole[row]
         assert hole is not None
-        pull = np.zeros(3)
-        for k, inside in ((row - 1, cable.channel[row - 1 - first]), (row + 1, cable.channel[row - first])):
-            way = rows.position[k] - rows.position[row]
-            size = length(way)
+        pull = [0.0, 0.0, 0.0]
+        for other, inside in ((row - 1, channel[row - 1 - first]), (row + 1, channel[row - first])):
+            size = math.dist(place[other], place[row])
             if not inside and size > 0.0:
-                pull += tension * way / size
-        found.append((hole, length(pull)))
+                pull = [p + tension * (a - b) / size for p, a, b in zip(pull, place[other], place[row], strict=True)]
+        found.append((hole, math.hypot(*pull)))
     return found
 
 

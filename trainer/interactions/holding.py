@@ -23,6 +23,8 @@ HOLD = 100.0
 #: puncture force. In a stitch this leaves nodes 0.1 µm (median; 2.4 µm at most in 99 of 100) from where they would
 #: come to rest, and forces 0.01 mN. Stored sessions that name no tolerance were made with it: leave it as it is.
 TOLERANCE_MN = 1e-2
+#: A hold that resists every way alike.
+EVERY_WAY = np.eye(3)
 #: Iterations of one solve; the next movement goes on where it stopped. In a stitch 2 solves of 1000 end here. With 6 a
 #: wall that is pulled fast no longer tears: while it moves, its forces are never settled enough to be judged.
 MOST_ITERATIONS = 8
@@ -45,7 +47,7 @@ def grips(world: World) -> Grips:
     k = HOLD * max(v.spec.modulus_kPa.value * v.spec.wall_mm for v in world.tissue.vessels)
     if world.contact is not None:
         n = world.contact.normal
-        matrix = k * (np.eye(3) if world.contact.stuck else np.outer(n, n))
+        matrix = k * (EVERY_WAY if world.contact.stuck else n[:, None] * n)
         add(world.contact.slot, world.needle_pose.position, matrix, None)
     if world.needle is not None:
         for hole in world.open_holes():
@@ -53,10 +55,10 @@ def grips(world: World) -> Grips:
                 arc = max(hole.arc, 0.0)
                 t = world.needle_pose.rotate(needle_tangent(world.needle, arc))
                 on_needle = world.needle_pose.apply(needle_point(world.needle, arc))
-                add(hole.slot, on_needle, k * (np.eye(3) - np.outer(t, t)), hole)
+                add(hole.slot, on_needle, k * (EVERY_WAY - t[:, None] * t), hole)
     for i, jaw in enumerate(world.jaws):
         for s, p in zip(jaw.slots, jaw.points, strict=True):
-            add(s, jaw.pose.apply(p), k * np.eye(3), i)
+            add(s, jaw.pose.apply(p), k * EVERY_WAY, i)
     return Grips(
         Anchors(np.array(slot, dtype=np.int64), np.array(target).reshape(-1, 3), np.array(stiffness).reshape(-1, 3, 3)),
         tuple(owner),

@@ -10,11 +10,12 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass, replace
+from operator import itemgetter
 
 import numpy as np
 
 from trainer.events import Break, Withdraw
-from trainer.geometry import Array, Rigid, cross, length, quaternion_from_axis_angle, quaternion_multiply, unit
+from trainer.geometry import Array, Rigid, cross, length, quaternion_from_axis_angle, quaternion_multiply
 from trainer.instruments.needle import needle_point
 from trainer.interactions import drape
 from trainer.interactions.pierce import close, draw
@@ -53,23 +54,23 @@ def constraints(world: World, lagging: bool = True) -> Constraints:
     ``lagging``: a grip gives, for the time being, the thread that the tissue has yet to let it have.
     """
     assert world.thread is not None and world.needle is not None
-    rows: list[tuple[float, int, Array, bool, Hole | None, int]] = []
+    rows: list[tuple[float, list[float], Hole | None, int]] = []
     if needle_is_placed(world):
-        rows.append((world.thread.needle_length, 0, swage(world), True, None, -1))
+        rows.append((world.thread.needle_length, swage(world).tolist(), None, -1))
     # Holes that meet on one arc keep the order in which the needle made them: the latest is nearest to it.
-    for order, hole in enumerate(reversed(world.open_holes())):
-        if hole.arc > world.needle.length:
-            rows.append((hole.arc, 1 + order, world.point(hole.place), False, hole, -1))
+    threaded = [hole for hole in reversed(world.open_holes()) if hole.arc > world.needle.length]
+    rows += [(h.arc, place, h, -1) for h, place in zip(threaded, world.points(threaded), strict=True)]
     for i, jaw in enumerate(world.jaws):
         if jaw.target == "thread":
-            rows.append((jaw.arc + lagging * jaw.lag_mm, 1000 + i, jaw.pose.position, True, None, i))
-    rows.sort(key=lambda r: r[:2])
+            rows.append((jaw.arc + lagging * jaw.lag_mm, jaw.pose.position.tolist(), None, i))
+    rows.sort(key=itemgetter(0))
+    arc, position, hole, grip = zip(*rows, strict=True) if rows else ((), (), (), ())
     return Constraints(
-        arc=np.array([r[0] for r in rows]),
-        position=np.array([r[2] for r in rows]).reshape(-1, 3),
-        hard=np.array([r[3] for r in rows], dtype=np.bool_),
-        hole=tuple(r[4] for r in rows),
-        grip=tuple(r[5] for r in rows),
+        arc=np.array(arc),
+        position=np.array(position).reshape(-1, 3),
+        hard=np.array([h is None for h in hole], dtype=np.bool_),
+        hole=hole,
+        grip=grip,
     )
 
 
@@ -88,11 +89,12 @@ def swage(world: World) -> Array:
 
 def runs(world: World, held: Constraints) -> list[tuple[int, int]]:
     """The stretches of whole thread between two neighbouring hard constraints: first and last row."""
-    hard = np.flatnonzero(held.hard)
+    arc, pieces = held.arc.tolist(), world.pieces.tolist()
+    hard = [row for row, hole in enumerate(held.hole) if hole is None]
     return [
-        (int(first), int(last))
+        (first, last)
         for first, last in itertools.pairwise(hard)
-        if np.any((world.pieces[:, 0] <= held.arc[first]) & (held.arc[last] <= world.pieces[:, 1]))
+        if any(s0 <= arc[first] and arc[last] <= s1 for s0, s1 in pieces)
     ]
 
 
@@ -102,23 +104,18 @@ def cables(world: World, held: Constraints) -> list[tuple[int, int, Cable]]:
     for first, last in runs(world, held):
         rows = range(first, last + 1)
         if len(rows) > 2:
-            holes = [held.hole[r] for r in rows]
+            holes, place = [held.hole[r] for r in rows], held.position[rows.start : rows.stop]
             # In the channel between the two holes of one wall the thread is as long as the channel is now.
-            channel = np.array(
-                [
-                    a is not None
-                    and b is not None
-                    and a.pass_number == b.pass_number
-                    and a.place.vessel == b.place.vessel
-                    for a, b in itertools.pairwise([*holes, None])
-                ]
-            )
-            place = held.position[rows.start : rows.stop]
-            inside = float(np.sum(np.linalg.norm(np.diff(place, axis=0), axis=1)[channel[:-1]]))
+            channel = [
+                a is not None and b is not None and a.pass_number == b.pass_number and a.place.vessel == b.place.vessel
+                for a, b in itertools.pairwise([*holes, None])
+            ]
+            spans = itertools.pairwise(place.tolist())
+            inside = sum(math.dist(a, b) for (a, b), hidden in zip(spans, channel, strict=False) if hidden)
             slots = np.array([h.slot if h is not None else -1 for h in holes], dtype=np.int64)
-            round_about = float(np.sum(drape.detours(world, held)[first:last]))
+            round_about = sum(drape.detours(world, held).tolist()[first:last])
             outside = float(held.arc[last] - held.arc[first]) - inside - round_about
-            found.append((first, last, Cable(slots, place, outside, channel)))
+            found.append((first, last, Cable(slots, place, outside, np.array(channel))))
     return found
 
 
@@ -141,7 +138,7 @@ def settle(world: World, time_s: float, slack: Slack | None) -> None:
         if world.draping is not None and world.draping.lacks:
             slack = slacken(world)
             # Else the holes cannot give what is lacking: the next movement finds the thread too short.
-            if not np.any(slack.slid.shortage > 0.0):
+            if not slack.slid.shortage.any():
                 _run_and_lay(world, time_s, slack)
 
 
@@ -158,7 +155,7 @@ def _run_and_lay(world: World, time_s: float, slack: Slack) -> None:
                 Withdraw, time_s, "", body=world.vessel_name(hole.place), wall=hole.place.wall, hole=hole.number,
                 pass_number=hole.pass_number, end="tail", reached_mm=hole.reached_mm,
             )  # fmt: skip
-    lay(world, constraints(world) if np.any(slid.pulled_out) else replace(held, arc=slid.arc))
+    lay(world, constraints(world) if slid.pulled_out.any() else replace(held, arc=slid.arc))
 
 
 def overdrawn(world: World, slack: Slack) -> tuple[int, int] | None:
@@ -169,9 +166,10 @@ def overdrawn(world: World, slack: Slack) -> tuple[int, int] | None:
     """
     assert world.thread is not None
     held, slid = slack.held, slack.slid
-    if not np.any(slid.shortage > 0.0):
+    if not slid.shortage.any():
         return None
-    for first, last in runs(world, held):
+    found = runs(world, held)
+    for first, last in found:
         lack = float(slid.shortage[first])
         if last - first == 1:
             if lack > RIGID_MM:
@@ -181,7 +179,7 @@ def overdrawn(world: World, slack: Slack) -> tuple[int, int] | None:
             if lack > min(MOST_LAG_MM, room - held.arc[last]):
                 return first, last
             world.jaws[held.grip[last]].lag_mm = lack
-    for first, last in runs(world, held):
+    for first, last in found:
         if last - first == 1 and slid.shortage[first] > 0.0:  # rounding
             world.jaws[held.grip[last]].lag_mm = float(slid.shortage[first])
     return None
@@ -191,8 +189,8 @@ def lay(world: World, held: Constraints) -> None:
     """Place the thread's nodes between the constraints; a needle that nothing holds trails behind."""
     assert world.thread is not None
     arc, position = held.arc, held.position
-    for s0, s1 in world.pieces:
-        if not np.any((arc >= s0) & (arc <= s1)):
+    for s0, s1 in world.pieces.tolist():
+        if not any(s0 <= s <= s1 for s in arc.tolist()):
             # Let go of, a piece stays where it lies; but the link that bent at the grip must be straight again.
             node = round((0.5 * (s0 + s1) - world.thread.needle_length) / world.thread.link)
             at = int(np.searchsorted(arc, s0))
@@ -250,7 +248,8 @@ def _towards_needle(held: Constraints, row: int) -> Array:
     if row == 0:
         return np.zeros(3)
     way = held.position[row - 1] - held.position[row]
-    return unit(way) if length(way) > 1e-9 else np.zeros(3)
+    size = length(way)
+    return way / size if size > 1e-9 else np.zeros(3)
 
 
 def _trail(world: World) -> None:

@@ -37,7 +37,7 @@ def watch(world: World, seen_before: list[bool], targets: list[Rigid]) -> None:
         return
     held = world.jaws[leader].tool_from_needle
     assert held is not None
-    way = math.dist(world.needle_pose.position, (targets[leader] @ held).position)
+    way = math.dist(world.needle_pose.position, targets[leader].apply(held.position))
     if way <= (FASTEST_MM_S / world.task.tick_hz if seen_before[leader] else STRAIGHT_MM):
         return
     tip = world.needle_pose.position

@@ -173,9 +173,17 @@ class World:
     def point(self, place: Place) -> Array:
         """Where a material point is now (3,) mm."""
         assert self.solver is not None
-        where = np.zeros((1, 3))
+        where = np.empty((1, 3))
         at_points(self.solver.x, place.nodes[None], place.weights[None], where)
-        return np.asarray(where[0])
+        return where[0]
+
+    def points(self, holes: list[Hole]) -> list[list[float]]:
+        """Where the material points of open ``holes`` are now, mm."""
+        if not holes:
+            return []
+        assert self.solver is not None
+        found: list[list[float]] = self.solver.positions([hole.slot for hole in holes]).tolist()
+        return found
 
     def vessel_name(self, place: Place) -> str:
         assert self.tissue is not None

@@ -20,6 +20,7 @@ from trainer.mechanics.attachments import Anchors, Cable, Frictions, Rows, flatt
 from trainer.mechanics.compliance import FREE, Compliance
 from trainer.mechanics.links import LinkMesh
 from trainer.mechanics.minimise import Base, Bodies, Held, Memory, approach
+from trainer.mechanics.quasi_newton import at_points
 
 #: Secant pairs kept from one solve to the next: fewer take more iterations where a thread draws at the tissue.
 PAIRS = 8
@@ -100,7 +101,13 @@ class Equilibrium:
 
     def position(self, slot: int) -> Array:
         """Where a material point is, (3,) mm."""
-        return np.asarray(self.compliance.slot_weights[slot] @ self.x[self.compliance.slot_nodes[slot]])
+        return np.asarray(self.positions([slot])[0])
+
+    def positions(self, slots: list[int]) -> Array:
+        """Where material points are, (k, 3) mm."""
+        held, found = self.compliance, np.empty((len(slots), 3))
+        at_points(self.x, held.slot_nodes[slots], held.slot_weights[slots], found)
+        return found
 
     def solve(
         self,
