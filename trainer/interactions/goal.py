@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
-from trainer.anatomy.vessel import wall_point
 from trainer.curriculum import TISSUE_STEPS, Step
 from trainer.interactions.region import Region
 from trainer.interactions.thread_pull import tail_mm
@@ -54,16 +51,13 @@ def gap_mm(world: World) -> float:
     """Distance of the cut edges of two vessels at the stitch that joins them, or of a structure's; 0 without either."""
     if world.region is not None:
         return max(map(world.region.parted_mm, world.region.severed), default=0.0)
-    if world.tissue is None or world.solver is None:
+    if world.solver is None:
         return 0.0
     outer: dict[int, Hole] = {h.place.vessel: h for h in world.open_holes() if h.place.wall == "outer"}
     if len(outer) != 2:
         return 0.0
-    edges = []
-    for v, hole in outer.items():
-        nodes, weights = wall_point(world.tissue.vessels[v], hole.place.clock, 0.0, "outer")
-        edges.append(weights @ world.solver.x[nodes + world.tissue.offset[v]])
-    return math.dist(*(np.asarray(e) for e in edges))
+    a, b = (weights @ world.solver.x[nodes] for nodes, weights in (hole.edge for hole in outer.values()))
+    return math.dist(a, b)
 
 
 def _driven(world: World, step: Step) -> set[int]:

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from trainer.anatomy.vessel import material_coordinates, ring
+from trainer.anatomy.vessel import material_coordinates, ring, wall_point
 from trainer.curriculum import VesselSpec
 from trainer.events import Contact, Pierce, PullThrough, Withdraw
 from trainer.geometry import Array, Rigid, cross, length, unit
@@ -112,7 +112,10 @@ def puncture(world: World, before: Rigid, after: Rigid, force: Array, start_s: f
     upright = unit(contact.normal + share * (normal - contact.normal))
     if all(h.arc > _needle_length(world) for h in world.open_holes()):
         world.passes += 1
-    hole = Hole(len(world.holes), contact.place, contact.slot, contact.inwards, world.passes, upright, arc=0.0)
+    hole = Hole(
+        len(world.holes), contact.place, contact.slot, contact.inwards, world.passes, upright, arc=0.0,
+        around=_around(world, contact.place), edge=_edge(world, contact.place),
+    )  # fmt: skip
     world.holes.append(hole)
     world.contact = None
     world.emit(
@@ -190,9 +193,21 @@ def passed(world: World, arc: float) -> np.ndarray:
     skip = np.zeros(len(world.surface), dtype=np.bool_)
     for hole in world.open_holes():
         if hole.arc < arc:
-            first, last = world.part[hole.place.vessel, hole.place.wall]
-            skip[first:last] |= np.isin(world.surface[first:last], hole.place.nodes).any(axis=1)
+            skip[hole.around] = True
     return skip
+
+
+def _around(world: World, place: Place) -> np.ndarray:
+    """The triangles (k,) of its wall that touch that of ``place``."""
+    first, last = world.part[place.vessel, place.wall]
+    return first + np.flatnonzero(np.isin(world.surface[first:last], place.nodes).any(axis=1))
+
+
+def _edge(world: World, place: Place) -> tuple[np.ndarray, Array]:
+    """The material point of the cut edge at the hour of ``place``: nodes (3,) of the whole tissue, weights (3,)."""
+    assert world.tissue is not None
+    nodes, weights = wall_point(world.tissue.vessels[place.vessel], place.clock, 0.0, "outer")
+    return nodes + world.tissue.offset[place.vessel], weights
 
 
 def _arc_through(world: World, at: Array) -> float:

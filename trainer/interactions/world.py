@@ -70,6 +70,8 @@ class Hole:
     pass_number: int
     normal: Array  # (3,) of the undented wall when it was pierced
     arc: float  # mm along needle and thread from the tip, of what is in the hole
+    around: np.ndarray  # (k,) the triangles of the wall that touch it
+    edge: tuple[np.ndarray, Array]  # the outer wall's cut edge at its hour: nodes (3,) and weights (3,)
     reached_mm: float = 0.0  # how far the tip got beyond the wall
     drawn_mm: float = 0.0  # how far what runs through it, towards the tip, has drawn the tissue along; bounded
     along: Array = field(default_factory=lambda: np.zeros(3))  # (3,) direction in which the thread runs through it

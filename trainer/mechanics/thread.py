@@ -81,9 +81,18 @@ def _constraints(arc: Array, position: Array) -> tuple[Array, Array]:
     p = np.ascontiguousarray(position, dtype=np.float64)
     if p.shape != (len(s), 3):
         raise ValueError(f"{len(s)} constraint arcs need positions of shape ({len(s)}, 3), not {p.shape}")
-    if not (np.isfinite(s).all() and (s[1:] >= s[:-1]).all()):
+    if not in_order(s):
         raise ValueError("constraints must come in the order of their arcs, which must be finite")
     return s, p
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def in_order(arcs: Array) -> bool:
+    """Whether arcs (c,) are finite and none is less than the one before it."""
+    for k in range(len(arcs)):
+        if not math.isfinite(arcs[k]) or (k > 0 and arcs[k] < arcs[k - 1]):
+            return False
+    return True
 
 
 def _nodes(model: ThreadModel, x: Array) -> Array:
