@@ -177,7 +177,7 @@ class World:
         assert self.solver is not None
         where = np.empty((1, 3))
         at_points(self.solver.x, place.nodes[None], place.weights[None], where)
-        return where[0]
+        return np.asarray(where[0])
 
     def points(self, holes: list[Hole]) -> list[list[float]]:
         """Where the material points of open ``holes`` are now, mm."""

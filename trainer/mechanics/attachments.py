@@ -91,43 +91,56 @@ class Rows(NamedTuple):
     rub_limit: Array  # (f,) mN
 
 
-def flatten(anchors: Anchors, cables: tuple[Cable, ...], frictions: Frictions) -> Rows:
-    """The rows of one solve. Raises ValueError when a number is not finite or a cable has fewer than two points."""
-    count = [len(c.slot) for c in cables]
-    cable_slot = np.array([n for c in cables for n in c.slot.tolist()], dtype=np.int64)
-    cable_place = np.zeros((len(cable_slot), 3))
-    for last, size, cable in zip(itertools.accumulate(count), count, cables, strict=True):
-        cable_place[last - size : last] = cable.place
-    cable_place[cable_slot >= 0] = 0.0
-    length = np.array([c.length_mm for c in cables], dtype=np.float64)
-    numbers = (
-        anchors.target, anchors.stiffness, cable_place, length, frictions.place, frictions.along, frictions.stiffness,
-        frictions.limit,
-    )  # fmt: skip
-    bad = first_not_finite(*numbers)
-    if bad >= 0:
-        raise ValueError(f"{NUMBERS[bad]} is not finite")
+def lay_out(anchored: np.ndarray, cables: list[np.ndarray], rubbed: np.ndarray) -> Rows:
+    """Rows for solves that hold the slots ``anchored`` (a,), those of ``cables`` (k,) each, and ``rubbed`` (f,), to be
+    given their numbers by :func:`fill`. Raises ValueError when a cable has fewer than two points."""
+    count = [len(cable) for cable in cables]
     if any(n < 2 for n in count):
         raise ValueError("a cable needs at least two points")
-    on_anchors, on_cables, rubbed = anchors.slot.tolist(), cable_slot.tolist(), frictions.slot.tolist()
-    slots = sorted({*on_anchors, *(n for n in on_cables if n >= 0), *rubbed})
+    on_anchors, on_rubbed = anchored.tolist(), rubbed.tolist()
+    on_cables = [n for cable in cables for n in cable.tolist()]
+    slots = sorted({*on_anchors, *(n for n in on_cables if n >= 0), *on_rubbed})
     at = {-1: -1} | {slot: u for u, slot in enumerate(slots)}
     return Rows(
         slots=np.array(slots, dtype=np.int64),
         anchor_at=np.array([at[n] for n in on_anchors], dtype=np.int64),
-        target=np.array(anchors.target, dtype=np.float64),
-        stiffness=np.array(anchors.stiffness, dtype=np.float64),
+        target=np.zeros((len(on_anchors), 3)),
+        stiffness=np.zeros((len(on_anchors), 3, 3)),
         cable_start=np.array([0, *itertools.accumulate(count)], dtype=np.int64),
         cable_at=np.array([at[n] for n in on_cables], dtype=np.int64),
-        cable_place=cable_place,
-        channel=np.array([n for c in cables for n in c.channel.tolist()], dtype=np.bool_),
-        length=length,
-        rub_at=np.array([at[n] for n in rubbed], dtype=np.int64),
-        rub_place=frictions.place,
-        rub_along=frictions.along,
-        rub_stiffness=frictions.stiffness,
-        rub_limit=frictions.limit,
+        cable_place=np.zeros((len(on_cables), 3)),
+        channel=np.zeros(len(on_cables), dtype=np.bool_),
+        length=np.zeros(len(cables)),
+        rub_at=np.array([at[n] for n in on_rubbed], dtype=np.int64),
+        rub_place=np.zeros((len(rubbed), 3)),
+        rub_along=np.zeros((len(rubbed), 3)),
+        rub_stiffness=np.zeros(len(rubbed)),
+        rub_limit=np.zeros(len(rubbed)),
     )
+
+
+def fill(rows: Rows, anchors: Anchors, cables: tuple[Cable, ...], frictions: Frictions) -> None:
+    """Gives ``rows`` the numbers of one solve. Raises ValueError when one is not finite."""
+    rows.target[:] = anchors.target
+    rows.stiffness[:] = anchors.stiffness
+    first = 0
+    for c, cable in enumerate(cables):
+        last = first + len(cable.slot)
+        rows.cable_place[first:last] = cable.place
+        rows.channel[first:last] = cable.channel
+        rows.length[c] = cable.length_mm
+        first = last
+    rows.cable_place[rows.cable_at >= 0] = 0.0
+    rows.rub_place[:] = frictions.place
+    rows.rub_along[:] = frictions.along
+    rows.rub_stiffness[:] = frictions.stiffness
+    rows.rub_limit[:] = frictions.limit
+    bad = first_not_finite(
+        rows.target, rows.stiffness, rows.cable_place, rows.length, rows.rub_place, rows.rub_along, rows.rub_stiffness,
+        rows.rub_limit,
+    )  # fmt: skip
+    if bad >= 0:
+        raise ValueError(f"{NUMBERS[bad]} is not finite")
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from trainer.geometry import Array
-from trainer.mechanics.attachments import Anchors, Cable, Frictions, Rows, flatten
+from trainer.mechanics.attachments import Anchors, Cable, Frictions, Rows, fill, lay_out
 from trainer.mechanics.compliance import FREE, Compliance
 from trainer.mechanics.links import LinkMesh
 from trainer.mechanics.minimise import Base, Bodies, Held, Memory, approach
@@ -41,13 +41,20 @@ class Result:
     cable_error_mm: float  # longest excess of a cable's path
 
 
+#: The slots of anchors, of each cable, and of frictions.
+_Slots = tuple[bytes, tuple[bytes, ...], bytes]
+
+
 class _Group(NamedTuple):
-    """Bodies that are solved together, because cables join them, and what holds them: numbers in the lists given."""
+    """Bodies that are solved together, because cables join them, what holds them (numbers in the lists given), and the
+    arrays of their solves."""
 
     bodies: list[int]
     anchors: list[int]
     cables: list[int]
     frictions: list[int]
+    rows: Rows
+    held: Held
 
 
 class Equilibrium:
@@ -85,16 +92,19 @@ class Equilibrium:
             v=np.zeros(3 * max(len(order) for order in orders), dtype=np.float32),
         )
         self._at_rest = [True] * bodies
-        self._last_target: dict[int, Array] = {}
+        self._last_target: dict[int, list[float]] = {}
         self._tension: dict[tuple[int, ...], float] = {}
+        self._groups: dict[_Slots, list[_Group]] = {}  # of what was held since a slot last came or went
         self._scratch: dict[tuple[int, ...], Held] = {}
 
     def hold(self, nodes: np.ndarray, weights: Array) -> int:
         """A slot for the material point that is the mean of ``nodes`` (3,) with ``weights`` (3,), all of one body."""
+        self._groups.clear()
         return self.compliance.hold(nodes, weights)
 
     def drop(self, slot: int) -> None:
         """Forgets a material point; its number may be given out again."""
+        self._groups.clear()
         self.compliance.drop(slot)
         self._last_target.pop(slot, None)
         self._tension = {k: v for k, v in self._tension.items() if slot not in k}
@@ -125,9 +135,12 @@ class Equilibrium:
         """
         anchors = Anchors.none() if anchors is None else anchors
         frictions = Frictions.none() if frictions is None else frictions
-        groups = self._groups(anchors, cables, frictions)
+        slots = anchors.slot.tobytes(), tuple(cable.slot.tobytes() for cable in cables), frictions.slot.tobytes()
+        if slots not in self._groups:
+            self._groups[slots] = self._grouped(anchors, cables, frictions)
+        groups = self._groups[slots]
         self._rest(groups)
-        targets: dict[int, Array] = {}
+        targets: dict[int, list[float]] = {}
         tension: dict[tuple[int, ...], float] = {}
         parts = [
             self._solve(group, anchors, cables, frictions, tolerance_mN, max_iterations, targets, tension)
@@ -145,7 +158,7 @@ class Equilibrium:
         all_frictions: Frictions,
         tolerance_mN: float,
         max_iterations: int,
-        targets: dict[int, Array],
+        targets: dict[int, list[float]],
         tensions: dict[tuple[int, ...], float],
     ) -> Result:
         """The equilibrium of one group of bodies; notes its ``targets`` and ``tensions`` for the next solve."""
@@ -158,12 +171,15 @@ class Equilibrium:
             frictions = Frictions(
                 frictions.slot[f], frictions.place[f], frictions.along[f], frictions.stiffness[f], frictions.limit[f]
             )
-        rows = flatten(anchors, cables, frictions)
-        held = self._held(group.bodies, rows, cables)
-        way = np.zeros_like(rows.target)
-        for n, slot in enumerate(anchors.slot.tolist()):
-            before = self._last_target.get(slot)
-            way[n] = rows.target[n] - (self.position(slot) if before is None else before)
+        rows, held = group.rows, group.held
+        fill(rows, anchors, cables, frictions)
+        held.nodes[:] = self.compliance.slot_nodes[rows.slots]
+        held.weights[:] = self.compliance.slot_weights[rows.slots]
+        slots, names = anchors.slot.tolist(), [tuple(cable.slot.tolist()) for cable in cables]
+        before = [self._last_target.get(slot) or self.position(slot).tolist() for slot in slots]
+        way = rows.target - np.array(before).reshape(-1, 3)
+        for n, name in enumerate(names):
+            held.multiplier[n] = self._tension.get(name, 0.0)
         anchor_force, tension = np.zeros_like(way), np.zeros(len(cables))
         self.compliance.start()
         converged, iterations, steps, residual, reached = approach(
@@ -172,8 +188,8 @@ class Equilibrium:
         )  # fmt: skip
         if iterations > steps * SLOW or not converged:
             self.compliance.refresh(group.bodies, self.x)
-        targets.update(zip(anchors.slot.tolist(), rows.target, strict=True))
-        tensions.update(zip(map(_key, cables), tension.tolist(), strict=True))
+        targets.update(zip(slots, rows.target.tolist(), strict=True))
+        tensions.update(zip(names, tension.tolist(), strict=True))
         return Result(
             converged=converged and reached == 1.0,
             iterations=iterations,
@@ -184,9 +200,9 @@ class Equilibrium:
             cable_error_mm=max(0.0, *held.stretch.tolist()) if cables else 0.0,
         )
 
-    def _groups(self, anchors: Anchors, cables: tuple[Cable, ...], frictions: Frictions) -> list[_Group]:
+    def _grouped(self, anchors: Anchors, cables: tuple[Cable, ...], frictions: Frictions) -> list[_Group]:
         """The bodies that something holds, those that a cable joins together. Raises ValueError for a free slot, and
-        for a cable through no material point."""
+        for a cable through no material point or with fewer than two points."""
         on_anchors, rubbed = self._bodies_of(anchors.slot), self._bodies_of(frictions.slot)
         on_cables = [self._bodies_of(cable.slot[cable.slot >= 0]) for cable in cables]
         if not all(on_cables):
@@ -196,15 +212,14 @@ class Equilibrium:
         for bodies in joined:
             apart = [g for g in groups if not g & bodies]
             groups = [*apart, bodies.union(*(g for g in groups if g & bodies))]
-        return [
-            _Group(
-                bodies=sorted(group),
-                anchors=[n for n, b in enumerate(on_anchors) if b in group],
-                cables=[n for n, through in enumerate(on_cables) if through[0] in group],
-                frictions=[n for n, b in enumerate(rubbed) if b in group],
-            )
-            for group in sorted(groups, key=min)
-        ]
+        found = []
+        for group in sorted(groups, key=min):
+            a = [n for n, b in enumerate(on_anchors) if b in group]
+            c = [n for n, through in enumerate(on_cables) if through[0] in group]
+            f = [n for n, b in enumerate(rubbed) if b in group]
+            rows = lay_out(anchors.slot[a], [cables[n].slot for n in c], frictions.slot[f])
+            found.append(_Group(sorted(group), a, c, f, rows, self._held(sorted(group), rows)))
+        return found
 
     def _bodies_of(self, slots: np.ndarray) -> list[int]:
         found = [self.compliance.slot_body[slot] for slot in slots.tolist()]
@@ -225,7 +240,7 @@ class Equilibrium:
         c = self.compliance
         return Base(tuple(c.factors), c.columns, c.slot_range, c.matrix)
 
-    def _held(self, awake: list[int], rows: Rows, cables: tuple[Cable, ...]) -> Held:
+    def _held(self, awake: list[int], rows: Rows) -> Held:
         """The arrays of one solve for the bodies ``awake``, kept for each size: a stitch has a few dozen."""
         u, c, k = len(rows.slots), len(rows.length), len(rows.cable_at)
         size = (u, c, k, *awake)
@@ -251,12 +266,7 @@ class Equilibrium:
                 curvature=np.zeros(PAIRS),
                 share=np.zeros(PAIRS),
             )
-        held = self._scratch[size]
-        held.nodes[:] = self.compliance.slot_nodes[rows.slots]
-        held.weights[:] = self.compliance.slot_weights[rows.slots]
-        for n, cable in enumerate(cables):
-            held.multiplier[n] = self._tension.get(_key(cable), 0.0)
-        return held
+        return self._scratch[size]
 
 
 def _together(groups: list[_Group], parts: list[Result], anchors: int, cables: int) -> Result:
@@ -273,7 +283,3 @@ def _together(groups: list[_Group], parts: list[Result], anchors: int, cables: i
         tension=tension,
         cable_error_mm=max((part.cable_error_mm for part in parts), default=0.0),
     )
-
-
-def _key(cable: Cable) -> tuple[int, ...]:
-    return tuple(int(s) for s in cable.slot)

@@ -89,10 +89,12 @@ def _constraints(arc: Array, position: Array) -> tuple[Array, Array]:
 @njit(cache=True, nogil=True, error_model="numpy")
 def in_order(arcs: Array) -> bool:
     """Whether arcs (c,) are finite and none is less than the one before it."""
-    for k in range(len(arcs)):
-        if not math.isfinite(arcs[k]) or (k > 0 and arcs[k] < arcs[k - 1]):
+    last = -math.inf
+    for arc in arcs:  # an arc that is no number is not in order
+        if not (last <= arc < math.inf):
             return False
-    return True
+        last = arc
+    return len(arcs) == 0 or arcs[0] > -math.inf
 
 
 def _nodes(model: ThreadModel, x: Array) -> Array:
