@@ -6,17 +6,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from allocations import kept_bytes
 from performing import one_drive, perform
 
 from trainer import scene
 from trainer.curriculum import Task, load_task
+from trainer.drivers import scripted_hands
 from trainer.drivers.scripted import ScriptedHands
 from trainer.events import Event, Grasp, Pierce, Tear, TrackingLost
 from trainer.geometry import Array, Rigid, quaternion_multiply, slerp
 from trainer.interactions import thread_pull
 from trainer.interactions.thread_pull import stretch
 from trainer.poses import ToolPoses
-from trainer.profile import Hand
+from trainer.profile import Hand, load_profile
 from trainer.scene import Scene
 
 STITCH = load_task("anastomosis/single-stitch").task
@@ -83,6 +85,28 @@ def test_the_same_hand_gives_the_same_events_and_so_do_its_poses() -> None:
     again = scene.build(one_drive())
     events = [e for p in first.poses for e in again.step(ToolPoses.unpack(p.pack()))]
     assert tuple(events) == first.events
+
+
+def test_a_tick_allocates_no_array_of_the_tissue() -> None:
+    """With the needle in a wall that it moves to and fro, and the thread behind it: less than a vector of all nodes."""
+    profile = load_profile("scripted-expert").profile
+    assert profile.hand is not None
+    s = scene.build(STITCH)
+    hands, seen = scripted_hands(profile.hand, STITCH, s.home, 0), s.home
+    while not s.world.holes:
+        seen = hands.poll(s.tick, s.view()) or seen
+        s.step(seen)
+    solver = s.world.solver
+    assert solver is not None
+    off = replace(seen, position=seen.position + 0.01)
+
+    def to_and_fro() -> None:
+        s.step(off)
+        s.step(seen)
+
+    _, most = kept_bytes(to_and_fro)
+    assert not s.outcome
+    assert most < solver.x.nbytes
 
 
 def test_a_scene_has_only_what_its_task_asks_for() -> None:

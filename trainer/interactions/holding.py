@@ -98,7 +98,7 @@ def equilibrate(world: World, before: Rigid, start_s: float, span_s: float, tool
     held = grips(world)
     rows = thread_pull.constraints(world, lagging=False) if world.thread is not None else None
     taut = thread_pull.cables(world, rows) if rows is not None else []
-    world.before = world.solver.x.copy()
+    world.before[:] = world.solver.x
     found = _solve(world, held, taut, tolerance_mN)
     if pierce.lift(world, start_s + span_s):
         held = grips(world)

@@ -87,7 +87,7 @@ def lift(world: World, time_s: float) -> bool:
         return False
     world.solver.drop(contact.slot)
     world.contact = None
-    world.before = world.solver.x.copy()
+    world.before[:] = world.solver.x
     return True
 
 
@@ -149,9 +149,9 @@ def follow_needle(world: World, time_s: float, tool: str) -> None:
         outside = _side(world, hole.place) * (1.0 if hole.inwards else -1.0) > 0.0
         if (arc < 0.0 and outside) or arc < -SLIPPED_MM:
             close(world, hole)
-            world.before = world.solver.x.copy()  # out of the hole as the wall lies now
+            world.before[:] = world.solver.x  # out of the hole as the wall lies now
             if world.last_seen is not None:
-                world.last_seen = LastSeen(world.needle_pose.position, world.before)
+                world.last_seen = LastSeen(world.needle_pose.position, world.before.copy())
             world.emit(Withdraw, time_s, tool, end="tip", **shared)
         elif arc > rear:
             hole.drawn_mm = 0.0

@@ -67,4 +67,5 @@ def find(world: World) -> None:
         passed[triangle] = True
         through[world.wall_of(triangle)] += 1 if inwards else -1
     if not any(through.values()):
-        world.last_seen, world.before = None, solver.x.copy()
+        world.last_seen = None
+        world.before[:] = solver.x
