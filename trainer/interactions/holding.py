@@ -6,6 +6,8 @@ forces, by which it is judged what gives way.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from trainer.geometry import Array, Rigid, length
@@ -30,7 +32,29 @@ EVERY_WAY = np.eye(3)
 MOST_ITERATIONS = 8
 
 
-def grips(world: World) -> Grips:
+@dataclass(frozen=True)
+class Skewered:
+    """A hole that the needle is in, and where."""
+
+    hole: Hole
+    place: Array  # (3,) mm, of the needle's point that is in it
+    tangent: Array  # (3,) of the needle there
+
+
+def on_needle(world: World) -> list[Skewered]:
+    """The holes that the needle is in; one that is ahead of the tip counts as at the tip."""
+    if world.needle is None:
+        return []
+    needle, pose, found = world.needle, world.needle_pose, []
+    for hole in world.open_holes():
+        if hole.arc <= needle.length:
+            arc = max(hole.arc, 0.0)
+            place, tangent = pose.apply(needle_point(needle, arc)), pose.rotate(needle_tangent(needle, arc))
+            found.append(Skewered(hole, place, tangent))
+    return found
+
+
+def grips(world: World, skewered: list[Skewered]) -> Grips:
     """The anchors of tip, shaft and jaws at the places where needle and instruments are now."""
     assert world.tissue is not None
     slot: list[int] = []
@@ -49,60 +73,51 @@ def grips(world: World) -> Grips:
         n = world.contact.normal
         matrix = k * (EVERY_WAY if world.contact.stuck else n[:, None] * n)
         add(world.contact.slot, world.needle_pose.position, matrix, None)
-    if world.needle is not None:
-        for hole in world.open_holes():
-            if hole.arc <= world.needle.length:
-                arc = max(hole.arc, 0.0)
-                t = world.needle_pose.rotate(needle_tangent(world.needle, arc))
-                on_needle = world.needle_pose.apply(needle_point(world.needle, arc))
-                add(hole.slot, on_needle, k * (EVERY_WAY - t[:, None] * t), hole)
+    for s in skewered:
+        add(s.hole.slot, s.place, k * (EVERY_WAY - s.tangent[:, None] * s.tangent), s.hole)
     for i, jaw in enumerate(world.jaws):
-        for s, p in zip(jaw.slots, jaw.points, strict=True):
-            add(s, jaw.pose.apply(p), k * EVERY_WAY, i)
+        for at, p in zip(jaw.slots, jaw.points, strict=True):
+            add(at, jaw.pose.apply(p), k * EVERY_WAY, i)
     return Grips(
         Anchors(np.array(slot, dtype=np.int64), np.array(target).reshape(-1, 3), np.array(stiffness).reshape(-1, 3, 3)),
         tuple(owner),
     )
 
 
-def drag(world: World) -> Frictions:
+def drag(world: World, skewered: list[Skewered]) -> Frictions:
     """Friction of needle and thread in their holes, which carry the tissue along until they slide."""
     scene = world.task.scene
-    slot, place, along, limit = [], [], [], []
-    for hole in world.open_holes():
-        on_needle = world.needle is not None and hole.arc <= world.needle.length
-        spec = scene.needle if on_needle else scene.thread
-        if spec is None or spec.drag_mN.value == 0.0:
-            continue
-        if on_needle:
-            assert world.needle is not None
-            arc = max(hole.arc, 0.0)
-            at = world.needle_pose.apply(needle_point(world.needle, arc))
-            way = world.needle_pose.rotate(needle_tangent(world.needle, arc))
-        else:
-            at, way = world.point(hole.place), hole.along
-        slot.append(hole.slot)
-        place.append(at + hole.drawn_mm * way)
-        along.append(way)
-        limit.append(spec.drag_mN.value)
-    if not slot:
+    rubbed: list[tuple[Hole, Array, Array, float]] = []
+    if scene.needle is not None and (limit := scene.needle.drag_mN.value):
+        rubbed += [(s.hole, s.place, s.tangent, limit) for s in skewered]
+    if scene.thread is not None and (limit := scene.thread.drag_mN.value):
+        threaded = [hole for hole in world.open_holes() if world.needle is None or hole.arc > world.needle.length]
+        rubbed += [(h, np.array(p), h.along, limit) for h, p in zip(threaded, world.points(threaded), strict=True)]
+    if not rubbed:
         return Frictions.none()
-    most = np.array(limit)
-    return Frictions(np.array(slot, dtype=np.int64), np.array(place), np.array(along), most / pierce.FULL_DRAG_MM, most)
+    most = np.array([limit for *_, limit in rubbed])
+    return Frictions(
+        slot=np.array([hole.slot for hole, *_ in rubbed], dtype=np.int64),
+        place=np.array([place + hole.drawn_mm * way for hole, place, way, _ in rubbed]),
+        along=np.array([way for *_, way, _ in rubbed]),
+        stiffness=most / pierce.FULL_DRAG_MM,
+        limit=most,
+    )
 
 
 def equilibrate(world: World, before: Rigid, start_s: float, span_s: float, tool: str, tolerance_mN: float) -> None:
     """Bring the tissue to equilibrium with all that holds it, then judge what gives way."""
     if world.tissue is None or world.solver is None:
         return
-    held = grips(world)
+    skewered = on_needle(world)
+    held = grips(world, skewered)
     rows = thread_pull.constraints(world, lagging=False) if world.thread is not None else None
     taut = thread_pull.cables(world, rows) if rows is not None else []
     world.before[:] = world.solver.x
-    found = _solve(world, held, taut, tolerance_mN)
+    found = _solve(world, held, skewered, taut, tolerance_mN)
     if pierce.lift(world, start_s + span_s):
-        held = grips(world)
-        found = _solve(world, held, taut, tolerance_mN)
+        held = grips(world, skewered)
+        found = _solve(world, held, skewered, taut, tolerance_mN)
     tip = next((found.anchor_force[r] for r, who in enumerate(held.owner) if who is None), None)
     if tip is not None and giving_way.settled(found, length(tip)):
         pierce.puncture(world, before, world.needle_pose, tip, start_s, span_s, tool)
@@ -110,12 +125,18 @@ def equilibrate(world: World, before: Rigid, start_s: float, span_s: float, tool
     giving_way.judge(world, held, rows, taut, found, start_s + span_s)
 
 
-def _solve(world: World, held: Grips, taut: list[tuple[int, int, Cable]], tolerance_mN: float) -> Result:
+def _solve(
+    world: World,
+    held: Grips,
+    skewered: list[Skewered],
+    taut: list[tuple[int, int, Cable]],
+    tolerance_mN: float,
+) -> Result:
     assert world.solver is not None
     return world.solver.solve(
         held.anchors,
         tuple(c for _, _, c in taut),
-        drag(world),
+        drag(world, skewered),
         tolerance_mN=tolerance_mN,
         max_iterations=MOST_ITERATIONS,
     )

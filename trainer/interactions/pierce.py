@@ -14,9 +14,9 @@ import numpy as np
 from trainer.anatomy.vessel import material_coordinates, ring, wall_point
 from trainer.curriculum import VesselSpec
 from trainer.events import Contact, Pierce, PullThrough, Withdraw
-from trainer.geometry import Array, Rigid, cross, length, unit
+from trainer.geometry import Array, Rigid, length, unit
 from trainer.instruments.needle import needle_closest, needle_point, needle_tangent
-from trainer.interactions.crossing import first_crossing, nearest_on_surface
+from trainer.interactions.crossing import first_crossing, nearest_on_surface, side
 from trainer.interactions.world import Hole, LastSeen, Place, TipContact, World
 
 #: A tip pushed hard but not along itself goes through as well, at this many puncture forces (assumed).
@@ -134,10 +134,9 @@ def follow_needle(world: World, time_s: float, tool: str) -> None:
         return
     rear = world.needle.length
     needle_from_scene = world.needle_pose.inverse()
-    for hole in world.open_holes():
-        if hole.arc > rear:
-            continue
-        point = world.point(hole.place)
+    holes = [hole for hole in world.open_holes() if hole.arc <= rear]
+    for hole, place in zip(holes, world.points(holes), strict=True):
+        point = np.array(place)
         arc = _arc_through(world, needle_from_scene.apply(point))
         draw(hole, arc)
         beyond = (world.needle_pose.position - point) @ hole.normal
@@ -228,8 +227,7 @@ def _arc_through(world: World, at: Array) -> float:
 def _side(world: World, place: Place) -> float:
     """Positive where the tip lies outwards of the triangle of ``place``, as the next crossing will judge it."""
     assert world.solver is not None
-    a, b, c = world.solver.x[place.nodes]
-    return float((world.needle_pose.position - a) @ cross(b - a, c - a))
+    return float(side(world.needle_pose.position, world.solver.x, place.nodes))
 
 
 def _needle_length(world: World) -> float:
