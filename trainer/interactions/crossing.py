@@ -28,7 +28,7 @@ def _side(px, py, pz, ax, ay, az, bx, by, bz, cx, cy, cz):  # type: ignore[no-un
 def side(p: Array, x: Array, nodes: np.ndarray) -> float:
     """Positive where the point ``p`` (3,) is on the side of the normal of the triangle of ``nodes`` (3,) of ``x``."""
     a, b, c = x[nodes[0]], x[nodes[1]], x[nodes[2]]
-    return _side(p[0], p[1], p[2], a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2])
+    return float(_side(p[0], p[1], p[2], a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2]))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
