@@ -74,6 +74,7 @@ def test_an_event_that_matters_is_written_at_once_with_all_before_it(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(log, "BATCH_S", NEVER_S)
+    monkeypatch.setattr(log, "PROMPT_S", NEVER_S)
     with closing(LogSink(path, header(SESSION))) as sink:
         sink.tick(step(0, contact(0)))
         sink.tick(step(1, pierce(1)))
@@ -82,10 +83,19 @@ def test_an_event_that_matters_is_written_at_once_with_all_before_it(
 
 def test_a_full_batch_is_written_at_once(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(log, "BATCH_S", NEVER_S)
+    monkeypatch.setattr(log, "PROMPT_S", NEVER_S)
     with closing(LogSink(path, header(SESSION))) as sink:
         for tick in range(log.BATCH_ROWS):
             sink.tick(step(tick, contact(tick)))
         wait_for_events(path, log.BATCH_ROWS)
+
+
+def test_a_tick_sets_the_thread_to_work_when_it_is_time(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(log, "BATCH_S", NEVER_S)
+    monkeypatch.setattr(log, "PROMPT_S", 0.0)
+    with closing(LogSink(path, header(SESSION))) as sink:
+        sink.tick(step(0, contact(0)))
+        wait_for_events(path, 1)
 
 
 def test_nothing_waits_for_the_end_of_the_session(path: Path) -> None:

@@ -113,7 +113,7 @@ class _Session:
     clock: Fast
     log: LogSink
     recording: RecordingSink | None
-    sinks: tuple[Sink, ...]  # the log first
+    sinks: tuple[Sink, ...]  # the log last: it sets its thread to work, which then has the pause between two ticks
     devices: ExitStack  # closes what was opened for the hand
 
 
@@ -187,7 +187,7 @@ def _open(stack: ExitStack, asked: Asked, clock: Fast) -> _Session:
     if published is not None:
         sinks.append(stack.enter_context(closing(IgtlinkSink(published.host, published.port, scene.tools))))
     log = stack.enter_context(closing(LogSink(asked.log_path, header)))
-    return _Session(asked, tissue, knee, scene, profile, driver, clock, log, recording, (log, *sinks), devices)
+    return _Session(asked, tissue, knee, scene, profile, driver, clock, log, recording, (*sinks, log), devices)
 
 
 def _run(

@@ -32,6 +32,7 @@ from trainer.sinks.surface import TickRecord
 
 BATCH_S = 0.1
 BATCH_ROWS = 256
+PROMPT_S = 0.08  # after so long a tick sets the thread to work, which else would begin in the midst of one
 BEAT_S = 1.0  # at least so often the session says that it is alive
 PATIENCE_S = 30.0  # so long a session that ends waits for another program that has locked the log
 URGENT = frozenset({"task_started", "pierce", "drop", "break", "tear", "overforce", "step_done", "task_done"})
@@ -56,6 +57,7 @@ class LogSink:
         self._queue: SimpleQueue[_Written] = SimpleQueue()
         self._batch: list[_Written] = []  # taken from the queue, not committed yet
         self._wake = threading.Event()
+        self._due = time.monotonic() + PROMPT_S  # when a tick will next set the thread to work
         self._stopping = False
         self._closed = False
         self._error: LogError | None = None
@@ -76,7 +78,9 @@ class LogSink:
         self._last_tick = record.tick
         rows = tuple((self._id, e.tick, e.seq, e.time_s, e.tool, e.kind, payload(e)) for e in record.events)
         self._queue.put(_Written(record.tick, poses, rows))
-        if self._queue.qsize() >= BATCH_ROWS or any(e.kind in URGENT for e in record.events):
+        now = time.monotonic()
+        if now >= self._due or self._queue.qsize() >= BATCH_ROWS or any(e.kind in URGENT for e in record.events):
+            self._due = now + PROMPT_S
             self._wake.set()
 
     @property
