@@ -160,12 +160,13 @@ class Recorder:
             # They cost as much as many frames: one drawing for each step of the task, one at the end.
             self._draw |= isinstance(event, StepDone | TaskDone)
         self._last = (moment.tick, moment.time_s)
-        if moment.frame is not None:
+        if moment.snapshot is not None:
+            frame = self._layout.frame(moment.snapshot)
             self._set_time(*self._last)
-            self._log_frame(moment.frame)
+            self._log_frame(frame)
             if self._draw and self._layout.pictures is not None:
                 self._draw = False
-                for name, picture in self._layout.pictures(moment.frame).items():
+                for name, picture in self._layout.pictures(frame).items():
                     self._stream.log(f"pictures/{name}", rr.Image(picture))
             for tool, closure in zip(self._header.tools, moment.closure, strict=True):
                 self._stream.log(f"closure/{tool}", rr.Scalars(closure))

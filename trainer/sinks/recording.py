@@ -25,7 +25,7 @@ from trainer.geometry import Array
 from trainer.log.record import Metric, SessionHeader
 from trainer.log.repair import repair_command
 from trainer.sinks.rrd_file import RecordingError
-from trainer.sinks.surface import Frame, Layout, TickRecord
+from trainer.sinks.surface import Layout, TickRecord
 
 #: Bytes that may wait in the pipe: as much as Linux gives to everybody, ten or more frames.
 PIPE_BYTES = 1 << 20
@@ -50,8 +50,8 @@ class Moment:
     tick: int
     time_s: float
     events: tuple[Event, ...]
-    frame: Frame | None
-    closure: Array  # (k,)
+    snapshot: Array | None  # (k,), of which the layout makes a frame; None for events alone
+    closure: tuple[float, ...]  # of each instrument
 
 
 #: What passes through the pipe, None at the end: where the pipe ends without it, the session was killed.
@@ -209,16 +209,17 @@ class RecordingSink:
         self._send()
         if self.error is not None:
             return
-        frame = None
+        snapshot = None
         last = any(isinstance(event, TaskDone) for event in record.events)
         if record.tick >= self._next_frame or last:
             self._next_frame = record.tick + self._ticks_per_frame
             if last or not self.waiting:
-                frame = record.frame()
+                snapshot = record.snapshot()
             else:
                 self.dropped_frames += 1
-        if frame is not None or record.events:
-            self._send(Moment(record.tick, record.time_s, record.events, frame, record.poses.closure))
+        if snapshot is not None or record.events:
+            closure = tuple(record.poses.closure.tolist())
+            self._send(Moment(record.tick, record.time_s, record.events, snapshot, closure))
 
     def metrics(self, metrics: tuple[Metric, ...]) -> None:
         """The scores, after the last tick: a scalar each, and a document with all of them."""
