@@ -50,7 +50,8 @@ def same(found: tuple[Array, ...], expected: list[Array]) -> None:
 def test_vessels_instruments_and_needle_are_where_the_scene_has_them() -> None:
     s = placed("anastomosis/single-stitch")
     world, out, frame = s.world, s.world.world_from_scene, shown(s)
-    assert world.tissue is not None and world.solver is not None
+    assert world.tissue is not None
+    assert world.solver is not None
     world.tissue_force_mN, world.tension_mN = 3.25, 1.5
     same(frame.vertices, [out.apply(world.solver.x[world.tissue.nodes(v)]) for v in (0, 1)])
     blades = [forceps.part_poses(out @ jaw.pose, jaw.closure) for jaw in world.jaws]
@@ -96,11 +97,9 @@ def test_what_was_copied_stays_as_it_was(task: str) -> None:
     """The pipe may take it later."""
     s = placed(task)
     copied = s.snapshot()
-    assert not any(np.shares_memory(copied, a) for a in (s.world.nodes, getattr(s.world.solver, "x", s.world.nodes)))
-    before = copied.copy()
-    world = s.world
+    world, before = s.world, copied.copy()
     for jaw in world.jaws:
-        jaw.pose.position += 1.0
+        jaw.pose.position[:] += 1.0
     if world.solver is not None:
         world.solver.x += 1.0
         world.nodes += 1.0

@@ -119,7 +119,7 @@ class RecorderProcess:
         data = pickle.dumps(plain, pickle.HIGHEST_PROTOCOL)
         size = 0 if values is None else values.nbytes
         self._waiting.append(memoryview(SIZES.pack(len(data), size) + data))
-        if values is not None:
+        if values is not None and size:
             self._waiting.append(values.data.cast("B"))
         self.push()
 
