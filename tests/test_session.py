@@ -14,7 +14,7 @@ from trainer.events import Event, StepDone, TaskDone, TickOverrun
 from trainer.geometry import Array
 from trainer.poses import ToolPoses
 from trainer.session import NO_POSE, admit, interruptible, run
-from trainer.sinks.surface import Frame, TickRecord
+from trainer.sinks.surface import TickRecord
 
 NOWHERE = (0.0, 0.0, 0.0)
 
@@ -55,8 +55,8 @@ class FakeScene:
     def view(self) -> str:
         return f"view at {self.tick}"
 
-    def frame(self) -> Frame:
-        return Frame((), np.zeros((0, 3)), np.zeros((0, 4)), None, None, (), 0.0, 0.0)
+    def snapshot(self) -> Array:
+        return np.zeros(0)
 
 
 class FakeDriver:

@@ -22,13 +22,13 @@ def test_rigid_structures_are_closed_surfaces_and_what_moves_is_drawn_where_it_i
     assert all(surface.fixed is not None and is_closed(surface.triangles) for surface in layout.surfaces)
     assert [(c.name, c.fixed) for c in layout.clouds] == [("tissue/posterior_cruciate_ligament", None)]
     assert layout.pictures is not None
-    before = layout.pictures(s.frame())
+    before = layout.pictures(layout.frame(s.snapshot()))
     now = s.view().poses
     for x, closure in ((-3.0, 0.0), (-3.0, 0.9), (-4.5, 0.9), (-6.0, 0.9)):
         position = now.position.copy()
         position[0] = s.world.world_from_scene.apply(np.array([x, -3.0, 0.0]))
         s.step(ToolPoses(position, now.quaternion, np.array([closure, 0.0]), np.ones(2, dtype=bool)))
-    after = layout.pictures(s.frame())
+    after = layout.pictures(layout.frame(s.snapshot()))
     assert list(before) == ["surface", "section", "volume"]
     for name, picture in before.items():
         assert picture.shape == (200, 200, 3)

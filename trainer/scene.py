@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from trainer import scene_rules, showing
+from trainer import scene_rules, showing, snapshot
 from trainer.anatomy import vessel as vessels
 from trainer.anatomy.imported import Anatomy
 from trainer.config import ConfigError
@@ -39,7 +39,7 @@ from trainer.interactions.world import Jaw, World
 from trainer.mechanics.equilibrium import Equilibrium
 from trainer.mechanics.thread import ThreadModel
 from trainer.poses import ToolPoses
-from trainer.sinks.surface import Frame, InstrumentPart, Layout, Surface
+from trainer.sinks.surface import InstrumentPart, Layout, Surface
 from trainer.view import View
 
 #: A tick in which an instrument or the needle's tip moves further than this is taken in several movements, mm.
@@ -279,7 +279,16 @@ class Scene:
         world = self.world
         scene = world.task.scene
         blades = [_shape(i.kind).parts() for i in scene.instrument]
+        reader = snapshot.Reader(
+            world.world_from_scene,
+            part_poses=tuple(_shape(i.kind).part_poses for i in scene.instrument),
+            needle=world.needle is not None,
+            vessels=tuple(len(v.mesh.rest) for v in self._vessels()),
+            clouds=tuple(map(len, self._clouds())),
+            thread=world.thread,
+        )
         return Layout(
+            frame=reader.frame,
             surfaces=tuple(
                 Surface(f"vessel/{v.spec.name}", v.display_triangles, (226, 120, 110, 205)) for v in self._vessels()
             )
@@ -300,27 +309,14 @@ class Scene:
             **_looks(world),
         )
 
-    def frame(self) -> Frame:
-        """A copy of everything that moves."""
-        world, out = self.world, self.world.world_from_scene
-        kinds = [i.kind for i in world.task.scene.instrument]
-        parts = [_shape(k).part_poses(out @ j.pose, j.closure) for k, j in zip(kinds, world.jaws, strict=True)]
-        needle = out @ world.needle_pose if world.needle is not None else None
-        return Frame(
-            vertices=tuple(
-                out.apply(world.solver.x[world.tissue.nodes(v)])
-                for v in range(len(self._vessels()))
-                if world.tissue is not None and world.solver is not None
-            ),
-            part_position=np.concatenate([p for p, _ in parts]),
-            part_quaternion=np.concatenate([q for _, q in parts]),
-            needle_position=needle.position if needle is not None else None,
-            needle_quaternion=needle.quaternion if needle is not None else None,
-            thread=tuple(out.apply(piece) for piece in thread_pull.drawn(world)),
-            force_mN=world.tissue_force_mN,
-            tension_mN=world.tension_mN,
-            clouds=tuple(out.apply(p) for p in showing.moving(world.region)) if world.region is not None else (),
-        )
+    def snapshot(self) -> Array:
+        """A copy of everything that moves (k,), for the ``frame`` of :meth:`layout`."""
+        world = self.world
+        held = thread_pull.constraints(world) if world.thread is not None else None
+        return snapshot.copy(world, held, self._clouds())
+
+    def _clouds(self) -> tuple[Array, ...]:
+        return showing.moving(self.world.region) if self.world.region is not None else ()
 
     def _vessels(self) -> tuple[vessels.Vessel, ...]:
         return self.world.tissue.vessels if self.world.tissue is not None else ()

@@ -16,8 +16,9 @@ import numpy as np
 from trainer.clock import Fast
 from trainer.drivers.driver import Driver, LiveDriver
 from trainer.events import Event, TickOverrun
+from trainer.geometry import Array
 from trainer.poses import ToolPoses
-from trainer.sinks.surface import Frame, Sink, TickRecord
+from trainer.sinks.surface import Sink, TickRecord
 
 #: Why an instrument counts as not seen whose numbers cannot be taken.
 NO_POSE = "its numbers are no pose"
@@ -40,7 +41,7 @@ class Scene(Protocol):
 
     def view(self) -> Any: ...
 
-    def frame(self) -> Frame: ...
+    def snapshot(self) -> Array: ...
 
 
 def run(
@@ -80,7 +81,7 @@ def run(
             events = scene.step(poses)
         if late or skipped_s:
             events = (*events, _overrun(tick, events, work_ms, skipped_s, clock))
-        record = TickRecord(tick, tick / clock.tick_hz, poses, events, scene.frame)
+        record = TickRecord(tick, tick / clock.tick_hz, poses, events, scene.snapshot)
         for sink in sinks:
             sink.tick(record)
         work_ms = clock.end()

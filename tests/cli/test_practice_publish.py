@@ -107,7 +107,7 @@ def server() -> Iterator[int]:
 
     def ticks() -> None:
         while not ended.wait(0.005):
-            sink.tick(TickRecord(0, 0.0, poses, (), lambda: pytest.fail("no frame is asked for")))
+            sink.tick(TickRecord(0, 0.0, poses, (), lambda: pytest.fail("no snapshot is asked for")))
 
     thread = threading.Thread(target=ticks)
     thread.start()

@@ -14,18 +14,19 @@ from tests.metrics.synthetic_session import performed, task_of
 from trainer.cli import export, report
 from trainer.exports.csv_files import FILES
 from trainer.exports.files import ExportError
+from trainer.geometry import Array
 from trainer.log.record import SessionRecord
 from trainer.log.schema import LogError
 from trainer.metrics import score
 from trainer.poses import ToolPoses
 from trainer.sinks.log import LogSink
-from trainer.sinks.surface import Frame, TickRecord
+from trainer.sinks.surface import TickRecord
 
 RUNNER = CliRunner()
 FULL = Path("/dev/full")
 
 
-def no_frame() -> Frame:
+def no_snapshot() -> Array:
     raise AssertionError("the log draws nothing")
 
 
@@ -35,7 +36,7 @@ def store(path: Path, made: SessionRecord) -> None:
         for i in range(len(made.position)):
             poses = ToolPoses(made.position[i], made.quaternion[i], made.closure[i], made.valid[i])
             events = tuple(e for e in made.events if e.tick == i)
-            sink.tick(TickRecord(i, i / made.header.tick_hz, poses, events, no_frame))
+            sink.tick(TickRecord(i, i / made.header.tick_hz, poses, events, no_snapshot))
         metrics = score(made, task_of())
         sink.finish(made.outcome, "", made.ticks, made.duration_s, None, None, metrics)
 

@@ -41,12 +41,12 @@ POSES = ToolPoses(
 IDENTITY = Transform("LeftToWorld", np.zeros(3), np.eye(3), 0.0)
 
 
-def no_frame() -> None:
+def no_snapshot() -> None:
     raise AssertionError("a sink of poses asks for no frame")
 
 
 def record(poses: ToolPoses = POSES) -> TickRecord:
-    return TickRecord(0, 0.0, poses, (), no_frame)  # type: ignore[arg-type]
+    return TickRecord(0, 0.0, poses, (), no_snapshot)  # type: ignore[arg-type]
 
 
 @contextmanager

@@ -12,11 +12,12 @@ from trainer.config import ConfigError
 from trainer.curriculum import Task, load_task
 from trainer.drivers import open_driver
 from trainer.events import Event, TrackingLost
+from trainer.geometry import Array
 from trainer.log.record import SessionHeader
 from trainer.log.schema import LogError
 from trainer.poses import ToolPoses
 from trainer.sinks.log import LogSink
-from trainer.sinks.surface import Frame, TickRecord
+from trainer.sinks.surface import TickRecord
 
 ROWS = 60
 Events = Mapping[int, tuple[Event, ...]]  # by tick
@@ -38,7 +39,7 @@ def stored() -> list[ToolPoses]:
     ]
 
 
-def no_frame() -> Frame:
+def no_snapshot() -> Array:
     raise AssertionError("the log needs no frame")
 
 
@@ -52,7 +53,7 @@ def log(
     )  # fmt: skip
     sink = LogSink(path, header)
     for tick, poses in enumerate(rows):
-        sink.tick(TickRecord(tick, tick / tick_hz, poses, events.get(tick, ()), no_frame))
+        sink.tick(TickRecord(tick, tick / tick_hz, poses, events.get(tick, ()), no_snapshot))
     sink.finish("failed", "the input ended", ticks, ticks / tick_hz, None, None, ())
     sink.close()
     return f"{path}#{header.id}"

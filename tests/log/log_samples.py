@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 
 from trainer import curriculum, events
+from trainer.geometry import Array
 from trainer.log.record import Metric, SessionHeader
 from trainer.poses import ToolPoses
 from trainer.sinks.log import LogSink
-from trainer.sinks.surface import Frame, TickRecord
+from trainer.sinks.surface import TickRecord
 
 TICK_HZ = 100.0
 METRICS = (
@@ -83,12 +84,12 @@ def task_done(tick: int, seq: int = 0, outcome: str = "completed", reason: str =
     )  # fmt: skip
 
 
-def no_frame() -> Frame:
+def no_snapshot() -> Array:
     raise AssertionError("the log draws nothing")
 
 
 def step(tick: int, *happened: events.Event) -> TickRecord:
-    return TickRecord(tick, tick / TICK_HZ, poses(tick), happened, no_frame)
+    return TickRecord(tick, tick / TICK_HZ, poses(tick), happened, no_snapshot)
 
 
 def write(path: Path, session_id: str, ticks: int = 12, metrics: tuple[Metric, ...] = METRICS, **changes: Any) -> None:

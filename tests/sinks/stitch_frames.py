@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import pickle
 from collections.abc import Iterator
 
 import numpy as np
@@ -82,6 +83,7 @@ def needle_line() -> Array:
 def layout() -> Layout:
     flesh = (226, 120, 110, 205)
     return Layout(
+        frame=unpacked,
         surfaces=(
             Surface("vessel/A", vessel_triangles(-1.0), flesh),
             Surface("vessel/B", vessel_triangles(1.0), flesh),
@@ -152,6 +154,17 @@ def frame(tick: int, ticks: int) -> Frame:
     )
 
 
+def packed(frame: Frame) -> Array:
+    """As a tick hands it over: whole float64, of which only the layout knows what they mean."""
+    data = pickle.dumps(frame)
+    return np.frombuffer(data + bytes(-len(data) % 8))
+
+
+def unpacked(values: Array) -> Frame:
+    frame: Frame = pickle.loads(values.tobytes())
+    return frame
+
+
 def closure(tool: int, phase: float) -> float:
     return 0.93 if tool == 1 else 0.5 + 0.4 * phase
 
@@ -172,7 +185,7 @@ def records(ticks: int = 300, hz: float = 100.0) -> Iterator[TickRecord]:
                 np.ones(2, dtype=bool),
             ),
             tuple(e for e in happened if e.tick == tick),
-            lambda tick=tick: frame(tick, ticks),
+            lambda tick=tick: packed(frame(tick, ticks)),
         )
 
 

@@ -13,23 +13,23 @@ import numpy as np
 import pytest
 from waiting import PATIENCE_S
 
-from trainer.geometry import quaternion_from_axis_angle
+from trainer.geometry import Array, quaternion_from_axis_angle
 from trainer.openigtlink import MessageParser, Transform
 from trainer.poses import ToolPoses
 from trainer.sinks.igtlink import IgtlinkSink, PublishError
-from trainer.sinks.surface import Frame, TickRecord
+from trainer.sinks.surface import TickRecord
 
 TURN = quaternion_from_axis_angle([0.0, 0.0, 1.0], 0.5)
 
 
-def no_frame() -> Frame:
+def no_snapshot() -> Array:
     raise AssertionError("a sink of poses asks for no frame")
 
 
 def record(x: float = 0.0, valid: tuple[bool, bool] = (True, True)) -> TickRecord:
     position = np.array([[x, 0.0, 0.0], [0.0, x, 0.0]])
     quaternion = np.array([TURN, [1.0, 0.0, 0.0, 0.0]])
-    return TickRecord(0, 0.0, ToolPoses(position, quaternion, np.zeros(2), np.array(valid)), (), no_frame)
+    return TickRecord(0, 0.0, ToolPoses(position, quaternion, np.zeros(2), np.array(valid)), (), no_snapshot)
 
 
 @pytest.fixture

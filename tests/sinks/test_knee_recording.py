@@ -32,7 +32,7 @@ def test_a_knee_is_recorded_with_its_surfaces_and_pictures(tmp_path: Path) -> No
         moved = replace(poses, position=position)
         events = s.step(moved) if tick < 39 else s.finish("aborted", "enough")
         done += sum(e.kind == "step_done" for e in events)
-        sink.tick(TickRecord(tick, tick / 100.0, moved, events, s.frame))
+        sink.tick(TickRecord(tick, tick / 100.0, moved, events, s.snapshot))
     sink.close()
     assert done == 1
     assert rrd("verify", path).returncode == 0

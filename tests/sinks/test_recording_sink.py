@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import rerun_cli
 from rerun.chunk import RrdReader
-from stitch_frames import METRICS, TOOLS, frame, header, layout, made_up_events, records
+from stitch_frames import METRICS, TOOLS, frame, header, layout, made_up_events, packed, records, unpacked
 from waiting import wait_for
 
 from trainer import events
@@ -142,9 +142,9 @@ def test_needle_thread_and_instruments_are_where_the_frame_says(path: Path) -> N
 
 def test_a_broken_thread_is_drawn_in_pieces_and_no_thread_as_none(tmp_path: Path) -> None:
     def cut(tick: TickRecord) -> TickRecord:
-        whole = tick.frame()
+        whole = unpacked(tick.snapshot())
         pieces = ((whole.thread[0][:40], whole.thread[0][40:]), ())[tick.tick % 2]
-        return dataclasses.replace(tick, frame=lambda: dataclasses.replace(whole, thread=pieces))
+        return dataclasses.replace(tick, snapshot=lambda: packed(dataclasses.replace(whole, thread=pieces)))
 
     path = tmp_path / "cut.rrd"
     sink = RecordingSink(path, header(), layout(), tick_hz=30.0, realtime=False)
@@ -208,10 +208,10 @@ def test_the_same_session_gives_the_same_recording_and_another_does_not(path: Pa
 
     def moved() -> Iterator[TickRecord]:
         for tick in records(TICKS):
-            shown = tick.frame()
+            shown = unpacked(tick.snapshot())
             if tick.tick == 100:
                 shown.vertices[1][7, 2] += VERTEX_STEP_MM
-            yield dataclasses.replace(tick, frame=lambda shown=shown: shown)
+            yield dataclasses.replace(tick, snapshot=lambda shown=shown: packed(shown))
 
     record_to(other, moved(), realtime=False)
     assert rrd("compare", "--unordered", path, other).returncode == 1
@@ -223,7 +223,7 @@ def test_in_real_time_frames_are_dropped_and_events_are_not(tmp_path: Path) -> N
     sink = RecordingSink(path, header(), layout(), tick_hz=30.0)
     os.kill(sink.pid, signal.SIGSTOP)
     first = next(records(1))
-    frames = 3 * recording.PIPE_BYTES // sum(v.nbytes for v in first.frame().vertices)
+    frames = 3 * recording.PIPE_BYTES // first.snapshot().nbytes
     for k in range(frames):
         slip = events.Slip(k, 0, k / 30.0, "left", target="thread", body="", load_mN=2.0, limit_mN=1.0)
         sink.tick(dataclasses.replace(first, tick=k, time_s=k / 30.0, events=(slip,)))
@@ -374,12 +374,13 @@ def test_a_message_that_was_interrupted_is_not_sent_twice(tmp_path: Path, monkey
     first, second = itertools.islice(records(10), 2)
     sink.tick(first)
 
-    def half(pipe: int, message: memoryview, write: Callable[[int, memoryview], int] = os.write) -> int:
-        write(pipe, message[: len(message) // 2])
+    def half(pipe: int, pieces: list[memoryview], write: Callable[[int, memoryview], int] = os.write) -> int:
+        write(pipe, pieces[0])
+        write(pipe, pieces[1][: len(pieces[1]) // 2])
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr(recording.os, "write", half)
+        patched.setattr(recording.os, "writev", half)
         with pytest.raises(KeyboardInterrupt):
             sink.tick(dataclasses.replace(first, tick=TICKS_PER_FRAME, events=second.events))
     with pytest.raises(RecordingError, match=r"cannot write the recording: it was interrupted; its end is missing$"):

@@ -21,7 +21,7 @@ from trainer.interactions import drape
 from trainer.interactions.pierce import close, draw
 from trainer.interactions.world import Hole, World
 from trainer.mechanics.attachments import Cable
-from trainer.mechanics.thread import Slid, break_at, closest, follow, length_error, polyline, slide
+from trainer.mechanics.thread import Slid, break_at, closest, follow, length_error, slide
 
 #: Thread without holes between two grips is rigid: more than this too short, mm, and something gives way.
 RIGID_MM = 1e-6
@@ -217,14 +217,6 @@ def thread_point(world: World, point: Array) -> tuple[float, float]:
     assert world.thread is not None
     held = constraints(world)
     return closest(world.thread, world.nodes, held.arc, held.position, world.pieces, point)
-
-
-def drawn(world: World) -> list[Array]:
-    """The thread's pieces as polylines (m, 3) mm, through its holes and grips."""
-    if world.thread is None:
-        return []
-    held = constraints(world)
-    return polyline(world.thread, world.nodes, held.arc, held.position, world.pieces)
 
 
 def stretch(world: World) -> float:

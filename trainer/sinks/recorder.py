@@ -1,7 +1,7 @@
 """The process that writes a recording: it imports rerun, and it alone.
 
 It is started by :class:`trainer.sinks.recording.RecorderProcess`, reads what the session tells it from its standard
-input (pickled: a Beginning, then Moments and scores, then None) and answers on its standard output: a line when it
+input (a Beginning, then Moments and scores, then None) and answers on its standard output: a line when it
 is ready, and why if it fails. Where its input ends without the None, the session's process was killed; the recording is
 finished then as well.
 
@@ -17,10 +17,12 @@ import os
 import pickle
 import signal
 import sys
+import time
 import tomllib
 from collections.abc import Iterator
 from contextlib import closing, suppress
-from typing import BinaryIO
+from io import FileIO
+from select import select
 
 import numpy as np
 import rerun as rr
@@ -44,7 +46,7 @@ from trainer.geometry import Array
 from trainer.log.record import Metric
 from trainer.sinks.blueprint import blueprint
 from trainer.sinks.normals import vertex_normals
-from trainer.sinks.recording import READY, Beginning, Message, Moment
+from trainer.sinks.recording import READY, SIZES, Beginning, Message, Moment
 from trainer.sinks.rrd_file import RrdFile
 from trainer.sinks.surface import Frame
 
@@ -59,6 +61,9 @@ NORMAL_STEP = 2.0**-8
 #: half the session. Of each flush rerun keeps some 60 kB for the file's footer: one every second adds 4 MB a minute
 #: (measured).
 FLUSH_S = 5.0
+
+#: So often it looks whether the session has told it something more, s; assumed. The pipe holds half a second.
+IDLE_S = 0.01
 
 STEEL = (176, 184, 192, 255)
 NEEDLE = (226, 230, 235, 255)
@@ -82,31 +87,48 @@ def main() -> None:
     code = 0
     with suppress(BrokenPipeError):  # a session that was killed hears no answer
         try:
-            _record(_messages(sys.stdin.buffer), answers)
+            _record(_messages(FileIO(sys.stdin.fileno())), answers)
         except Exception as error:  # of whatever kind: the session goes on without its recording
             code = 1
             os.write(answers, (getattr(error, "reason", "") or str(error) or type(error).__name__).encode())
     os._exit(code)  # all is written and closed; to take the modules apart takes another half second
 
 
-def _record(messages: Iterator[Message], answers: int) -> None:
+def _record(messages: Iterator[tuple[Message, Array]], answers: int) -> None:
     os.nice(NICER)
     _normals(np.zeros((1, 3)), np.zeros((1, 3), dtype=np.int32))  # to load the kernel takes half a second
-    beginning = next(messages, None)
+    beginning, _ = next(messages, (None, None))
     if not isinstance(beginning, Beginning):  # the session was refused
         return
     with closing(Recorder(beginning)) as recorder:
         os.write(answers, READY)
-        for message in messages:
-            recorder.write(message)
+        for message, values in messages:
+            recorder.write(message, values)
 
 
-def _messages(source: BinaryIO) -> Iterator[Message]:
-    """Until the session says that it is over, or the pipe ends. Raises UnpicklingError where it ends within a message:
-    who is left to hear it has lost the rest."""
+def _messages(source: FileIO) -> Iterator[tuple[Message, Array]]:
+    """Each with the array behind it, until the session says that it is over, or the pipe ends."""
     with suppress(EOFError):
-        while (message := pickle.load(source)) is not None:
-            yield message
+        while True:
+            # Who waits in a read is woken by the write: in a tick of the session that takes 30 µs (measured).
+            while not select([source], [], [], 0.0)[0]:
+                time.sleep(IDLE_S)
+            size, behind = SIZES.unpack(_read(source, SIZES.size))
+            message, values = pickle.loads(_read(source, size)), np.frombuffer(_read(source, behind))
+            if message is None:
+                return
+            yield Moment(*message) if isinstance(message, tuple) else message, values
+
+
+def _read(source: FileIO, size: int) -> bytearray:
+    """Raises EOFError where the pipe ends before."""
+    data = bytearray(size)
+    rest = memoryview(data)
+    while rest:
+        if not (count := source.readinto(rest)):
+            raise EOFError
+        rest = rest[count:]
+    return data
 
 
 class Recorder:
@@ -133,12 +155,12 @@ class Recorder:
         self._log_header()
         self._log_layout()
 
-    def write(self, message: Message) -> None:
-        """One moment, or the scores after the last one."""
+    def write(self, message: Message, values: Array) -> None:
+        """One moment with what moves in it, or the scores after the last one."""
         match message:
             case Moment():
-                self._write(message)
-            case tuple():
+                self._write(message, values)
+            case list():
                 self._log_metrics(message)
         if self._file.error is not None:
             raise self._file.error
@@ -150,7 +172,7 @@ class Recorder:
         if self._file.error is not None:
             raise self._file.error
 
-    def _write(self, moment: Moment) -> None:
+    def _write(self, moment: Moment, values: Array) -> None:
         if moment.tick >= self._next_flush:
             self._stream.flush()
             self._next_flush = moment.tick + round(self._tick_hz * min(FLUSH_S, max(1.0, moment.time_s)))
@@ -160,12 +182,13 @@ class Recorder:
             # They cost as much as many frames: one drawing for each step of the task, one at the end.
             self._draw |= isinstance(event, StepDone | TaskDone)
         self._last = (moment.tick, moment.time_s)
-        if moment.frame is not None:
+        if len(values):
+            frame = self._layout.frame(values)
             self._set_time(*self._last)
-            self._log_frame(moment.frame)
+            self._log_frame(frame)
             if self._draw and self._layout.pictures is not None:
                 self._draw = False
-                for name, picture in self._layout.pictures(moment.frame).items():
+                for name, picture in self._layout.pictures(frame).items():
                     self._stream.log(f"pictures/{name}", rr.Image(picture))
             for tool, closure in zip(self._header.tools, moment.closure, strict=True):
                 self._stream.log(f"closure/{tool}", rr.Scalars(closure))
@@ -270,7 +293,7 @@ class Recorder:
             case Release(tool=tool) | Slip(tool=tool):
                 log(f"state/{tool}", rr.StateChange(state=[]))  # a gap in the lane; `rrd verify` refuses null
 
-    def _log_metrics(self, metrics: tuple[Metric, ...]) -> None:
+    def _log_metrics(self, metrics: list[Metric]) -> None:
         self._set_time(*self._last)
         for metric in metrics:
             if metric.value is not None:
@@ -311,7 +334,7 @@ def _short(value: object) -> str:
     return str(value)
 
 
-def _scores(metrics: tuple[Metric, ...]) -> str:
+def _scores(metrics: list[Metric]) -> str:
     """A Markdown table of the metrics with their target bands and sources."""
     rows = ["| measure | value | unit | target | source |", "|---|---:|---|---|---|"]
     for m in metrics:

@@ -50,6 +50,8 @@ class Cloud:
 class Layout:
     """What a recording needs to know before the first frame."""
 
+    #: Makes a frame of what a tick has copied, in any process: it can be pickled.
+    frame: Callable[[Array], Frame]
     surfaces: tuple[Surface, ...]
     parts: tuple[InstrumentPart, ...]
     needle: Array | None  # (m, 3) mm centre line in the needle's own frame, tip first
@@ -66,7 +68,7 @@ class Layout:
 
 @dataclass(frozen=True)
 class Frame:
-    """A copy of the scene at one tick, safe to hand to another thread or process."""
+    """What moves in a scene, at one tick, in the world."""
 
     vertices: tuple[Array, ...]  # per surface that is not fixed, (v, 3) mm, world
     part_position: Array  # (p, 3) mm, world_from_part
@@ -87,7 +89,7 @@ class TickRecord:
     time_s: float
     poses: ToolPoses
     events: tuple[Event, ...]
-    frame: Callable[[], Frame]  # makes the copy only when asked
+    snapshot: Callable[[], Array]  # copies what moves (k,), only when asked; the layout makes a frame of it
 
 
 class Sink(Protocol):
