@@ -77,7 +77,7 @@ def relieve(world: World, time_s: float) -> thread_pull.Slack | None:
         slack = thread_pull.slacken(world)
         found = thread_pull.overdrawn(world, slack)
         if found is None:
-            return slack if not any(jaw.lag_mm for jaw in world.jaws) else thread_pull.slacken(world)
+            return thread_pull.lend(world, slack.held) if any(jaw.lag_mm for jaw in world.jaws) else slack
         # Rigid, its load rises until something gives way.
         _draw(world, slack.held, *found, math.inf, time_s)
 

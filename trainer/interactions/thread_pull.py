@@ -21,7 +21,7 @@ from trainer.interactions import drape
 from trainer.interactions.pierce import close, draw
 from trainer.interactions.world import Hole, World
 from trainer.mechanics.attachments import Cable
-from trainer.mechanics.thread import Slid, break_at, closest, follow, length_error, slide
+from trainer.mechanics.thread import Slid, break_at, closest, follow, in_order, length_error, slide
 
 #: Thread without holes between two grips is rigid: more than this too short, mm, and something gives way.
 RIGID_MM = 1e-6
@@ -121,8 +121,18 @@ def cables(world: World, held: Constraints) -> list[tuple[int, int, Cable]]:
 
 def slacken(world: World) -> Slack:
     """How the thread slides through its holes, as everything is now."""
+    return _slackened(world, constraints(world))
+
+
+def lend(world: World, held: Constraints) -> Slack:
+    """How the thread slides where ``held`` holds it, with what its grips give for the time being."""
+    arcs = zip(held.arc.tolist(), held.grip, strict=True)
+    arc = np.array([s if grip < 0 else s + world.jaws[grip].lag_mm for s, grip in arcs])
+    return _slackened(world, replace(held, arc=arc) if in_order(arc) else constraints(world))
+
+
+def _slackened(world: World, held: Constraints) -> Slack:
     assert world.thread is not None
-    held = constraints(world)
     return Slack(
         held, slide(world.thread, held.arc, held.position, held.hard, world.pieces, drape.detours(world, held))
     )
