@@ -194,6 +194,28 @@ def test_a_component_that_is_not_there_has_no_method() -> None:
     assert thread_method(STITCH.scene.thread) is not None
 
 
+def test_a_thread_is_told_with_the_error_that_was_measured_for_its_model(report: Path) -> None:
+    """Of the nearest number of links, 100 here, and of its own method; a report without such a row says so."""
+    sizes = [
+        row("follow-the-leader", "paper", ms, error, size=size, case="drag, suture")
+        for size, ms, error in ((50, 0.1, 0.7), (210, 0.2, 0.8), (1000, 0.3, 0.9))
+    ]
+    others = [
+        row("rod", "10 ms", 0.1, 0.01, size=100, case="drag, suture"),
+        row("follow-the-leader", "paper", 0.1, 0.2, size=100, case="drag, bare"),
+    ]
+    report.write_text(json.dumps({"rows": [*others, *sizes]}))
+    found = thread_method(STITCH.scene.thread, report)
+    assert found is not None
+    assert (found["links"], found["measured_ms"], found["model_error"]) == (100, 0.1, 0.7)
+    assert found["model_error_of"].endswith("speed_error.json, 'drag, suture', 50 links")
+    report.write_text(json.dumps({"rows": others}))
+    found = thread_method(STITCH.scene.thread, report)
+    assert found is not None
+    assert (found["measured_ms"], found["model_error"]) == (None, None)
+    assert found["model_error_of"] == "model: not measured"
+
+
 # ---- the choice is kept with the session ---------------------------------------------------------------------------
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -87,6 +88,18 @@ def test_loads_have_the_resultants_that_the_theories_take(
         assert outwards == pytest.approx(sides * math.cos(math.pi / 12), rel=1e-12)
     if load == "squeeze":  # 1 mN/mm, twice
         assert outwards == pytest.approx(-2.0 * model.LENGTH_MM, rel=1e-12)
+
+
+@pytest.mark.parametrize("load", list(LOADS))
+def test_what_is_held_leaves_no_rigid_motion_and_takes_no_part_of_a_balanced_load(load: str) -> None:
+    """The six rigid motions are told apart by the coordinates that stay; squeezed, by six and not one more."""
+    t = model.tube(9, 12)
+    held = model.held(t, load)
+    motions = [np.tile(along, (len(t.mesh.rest), 1)) for along in np.eye(3)]
+    motions += [np.cross(about, t.mesh.rest) for about in np.eye(3)]
+    assert np.linalg.matrix_rank(np.array([m.ravel()[held] for m in motions])) == 6
+    if load == "squeeze":
+        assert np.count_nonzero(held) == 6
 
 
 def test_quadratic_finite_elements_meet_the_theories_of_stretch_twist_and_bending() -> None:
@@ -176,20 +189,25 @@ def test_cubes_have_the_moduli_that_their_links_sum_up_to() -> None:
 
 
 def test_a_session_tells_the_models_errors_of_the_report(rows: list[Row], tmp_path: Path) -> None:
-    """Those of as many nodes around, which the task has; an older report has none, and says so."""
+    """Those of the nearest number of nodes around; an older report has none, and says so."""
     packaged = page.document({"model": rows}, {}, quick=True)["rows"]
     like = {"case": "tracking, cut free", "status": "converged", "error_of": "solver: … in radii", "size": 1000}
     kept = like | {"method": "kept factor", "setting": "to 0.001 mN", "median_ms": 1.0, "error": 1e-6}
-    told = {}
-    for name, others in (("new", packaged), ("old", [])):
-        report = tmp_path / f"{name}.json"
-        report.write_text(json.dumps({"rows": [kept, *others]}))
-        found = choose_tissue(STITCH, "t.toml", report)
+    reports = {name: tmp_path / f"{name}.json" for name in ("new", "old")}
+    reports["new"].write_text(json.dumps({"rows": [kept, *packaged]}))
+    reports["old"].write_text(json.dumps({"rows": [kept]}))
+    for around, nearest in ((12, 12), (16, 12), (18, 24), (24, 24), (60, 24)):
+        alike = tuple(replace(vessel, around=around) for vessel in STITCH.scene.vessel)
+        task = replace(STITCH, scene=replace(STITCH.scene, vessel=alike))
+        expected = {r.case: r.error for r in rows if (r.method, r.setting) == ("link mesh", f"{nearest} around")}
+        found = choose_tissue(task, "t.toml", reports["new"])
         assert found is not None
-        told[name] = found.model_error, found.model_error_of
-    expected = {r.case: r.error for r in rows if (r.method, r.setting) == ("link mesh", "24 around")}
-    assert told["new"] == (expected, f"{model.ERROR_OF}; new.json, 24 nodes around")
-    assert told["old"] == ({}, "model: not measured")
+        assert set(found.model_error) == set(LOADS)
+        assert found.model_error == expected
+        assert found.model_error_of == f"{model.ERROR_OF}; new.json, {nearest} nodes around"
+        found = choose_tissue(task, "t.toml", reports["old"])
+        assert found is not None
+        assert (found.model_error, found.model_error_of) == ({}, "model: not measured")
 
 
 def test_the_readme_tells_the_models_errors(rows: list[Row]) -> None:
