@@ -48,8 +48,8 @@ def in_tetrahedra(layers: int, around: int) -> tuple[Vessel, MeshTet]:
 def test_the_two_matrices_are_those_of_the_program_and_of_finite_elements() -> None:
     """The links' is the stiffness of the vessel that a scene is built of; the solid's that of scikit-fem's elements.
 
-    Both to rounding: sums of some 30 terms of up to 1e3 mN/mm. And they have the same zeros, which is why they cost
-    the same; an entry that happens to vanish is stored as well.
+    Both to rounding: sums of some 30 terms of up to 1e3 mN/mm. And they have the same places for entries, so that a
+    solve costs the same; an entry that happens to vanish has its place, too.
     """
     t, mesh = in_tetrahedra(5, 8)
     cells = wall_tetrahedra(5, 8)

@@ -9,10 +9,10 @@ stretched along their sides, the diagonals of their faces, and their own: their 
 
 Two models have the same tetrahedra, nodes and loads, and the Poisson ratio 1/4 that links have by themselves. Linear
 finite elements show what the mesh is to blame for, with one cell across the wall; what they get right and the link mesh
-does not is the links'. Both matrices have the same zeros and cost the same: the time is that of the matrix and of one
-sparse direct solve; of the cubes, which need none, that of making their links. How exactly a scene solves its links is
-another error, and a far smaller one: that of the section on the static equilibrium. The thread's model, which leaves
-out weight, inertia and stiffness, is follow-the-leader in the section on the thread, in *drag, suture*.
+does not is the links', and more nodes do not cure it. Both matrices have the same zeros. The time is that of the matrix
+and of one sparse direct solve; of the cubes, which need none, that of making their links. How exactly a scene solves
+its links is another error, and a far smaller one: that of the section on the static equilibrium. The thread's model,
+which leaves out weight, inertia and stiffness, is follow-the-leader in the section on the thread, in *drag, suture*.
 """
 
 from __future__ import annotations
