@@ -60,7 +60,7 @@ def chosen(
 def test_the_cheapest_within_the_budget_is_taken(report: Path) -> None:
     found = chosen(report, KEPT)
     assert (found.method, found.setting, found.nodes) == ("kept factor", "to 0.001 (2e-2 mN)", 1000)
-    assert (found.measured_ms, found.measured_error_mm, found.tolerance_mN) == (2.0, 0.002, 0.02)
+    assert (found.measured_ms, found.measured_solver_error_mm, found.tolerance_mN) == (2.0, 0.002, 0.02)
     assert found.source == "speed_error.json, 'tracking, cut free', 1000 nodes"
     assert chosen(report, KEPT[::-1]) == found
     assert chosen(report, KEPT, budget=0.005).tolerance_mN == 0.2  # met exactly
@@ -169,7 +169,7 @@ def test_a_vessel_of_other_size_and_stiffness_is_measured_by_its_own_units(repor
     mixed = [replace(STITCH, scene=s, step=STITCH.step[2:]) for s in scenes]
     budgets = (0.006, 0.003, 0.003)
     found = [chosen(report, KEPT, task, budget) for task, budget in zip(mixed, budgets, strict=True)]
-    assert [f.measured_error_mm for f in found] == [0.004, 0.002, 0.002]
+    assert [f.measured_solver_error_mm for f in found] == [0.004, 0.002, 0.002]
     assert [f.tolerance_mN for f in found] == pytest.approx([0.08, 0.01, 0.01], rel=1e-12)
 
 
@@ -183,7 +183,7 @@ def test_every_shipped_task_has_a_method_by_the_shipped_report(reference: str) -
         return
     assert found is not None
     assert found.budget == task_file.task.solver
-    assert found.measured_error_mm <= found.budget.node_error_mm
+    assert found.measured_solver_error_mm <= found.budget.node_error_mm
     assert found.tolerance_mN <= found.budget.force_error_mN
     assert found.cheapest.measured_ms <= found.measured_ms
 
@@ -192,6 +192,28 @@ def test_a_component_that_is_not_there_has_no_method() -> None:
     assert choose_tissue(bare(), "t.toml", Path("no such report")) is None
     assert thread_method(None) is None
     assert thread_method(STITCH.scene.thread) is not None
+
+
+def test_a_thread_is_told_with_the_error_that_was_measured_for_its_model(report: Path) -> None:
+    """Of the nearest number of links, 100 here, and of its own method; a report without such a row says so."""
+    sizes = [
+        row("follow-the-leader", "paper", ms, error, size=size, case="drag, suture")
+        for size, ms, error in ((50, 0.1, 0.7), (210, 0.2, 0.8), (1000, 0.3, 0.9))
+    ]
+    others = [
+        row("rod", "10 ms", 0.1, 0.01, size=100, case="drag, suture"),
+        row("follow-the-leader", "paper", 0.1, 0.2, size=100, case="drag, bare"),
+    ]
+    report.write_text(json.dumps({"rows": [*others, *sizes]}))
+    found = thread_method(STITCH.scene.thread, report)
+    assert found is not None
+    assert (found["links"], found["measured_ms"], found["model_error"]) == (100, 0.1, 0.7)
+    assert found["model_error_of"].endswith("speed_error.json, 'drag, suture', 50 links")
+    report.write_text(json.dumps({"rows": others}))
+    found = thread_method(STITCH.scene.thread, report)
+    assert found is not None
+    assert (found["measured_ms"], found["model_error"]) == (None, None)
+    assert found["model_error_of"] == "model: not measured"
 
 
 # ---- the choice is kept with the session ---------------------------------------------------------------------------

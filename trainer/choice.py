@@ -6,6 +6,9 @@ scene can run on is another question. Tissue: the kept factor alone, since no ot
 loads; so its tolerance is what is chosen, and a method that would be cheaper is named beside it. Thread: following the
 leader alone, which is exact in its lengths, so there is nothing to choose.
 
+All that is the error of a solver. That of the model, which is far larger, comes from the same report and is told beside
+it: of the link mesh against the theory of a solid, and of the thread against one with weight, inertia and stiffness.
+
 A report speaks of the vessel of its own bench. Another vessel of the same proportions behaves the same in units of
 its own: lengths in radii, forces in modulus times wall thickness times radius (the links' stiffness is proportional
 to modulus times thickness). With other proportions this is an approximation.
@@ -15,6 +18,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +30,8 @@ from trainer.data_files import data_folder
 
 #: The rows that are like a task: an instrument leads a vessel's end that is cut free at 100 frames a second.
 CASE = "tracking, cut free"
+#: The rows that are like a scene's thread: 100 mm of suture, one end of which is led around a loop in a second.
+THREAD_CASE, THREAD_METHOD = "drag, suture", "follow-the-leader"
 #: Methods that a scene's tissue can run on.
 RUNNABLE = ("kept factor",)
 #: The vessel of these rows (``trainer/bench/vessel.py``): outer radius and wall in mm, modulus in kPa.
@@ -34,6 +40,8 @@ BENCH_RADIUS_MM, BENCH_WALL_MM, BENCH_MODULUS_KPA = 0.5, 0.15, 500.0
 
 #: The force in a setting as the report words it: ``to 0.01 mN``, ``to 0.001 (0.07 mN)``.
 FORCE = re.compile(r"([\d.]+(?:e[+-]?\d+)?) mN")
+#: The rows of what a link mesh gets wrong, and how many nodes around it has (``trainer/bench/model.py``).
+MESH, AROUND = "link mesh", re.compile(r"(\d+) around")
 
 
 @dataclass(frozen=True)
@@ -44,7 +52,7 @@ class Measured:
     setting: str
     nodes: int  # of the vessel that it was measured on
     measured_ms: float  # median of a frame
-    measured_error_mm: float  # largest distance of a node to where it would come to rest
+    measured_solver_error_mm: float  # largest distance of a node to where it would come to rest
     tolerance_mN: float  # unbalanced force at which a solve ends
 
 
@@ -55,6 +63,8 @@ class Choice(Measured):
     budget: SolverSpec
     source: str  # of the measurement
     cheapest: Measured  # of all methods that meet the budget; another one than chosen is one that no scene runs on
+    model_error: dict[str, float]  # under each load that was measured, a share; empty where the report has none
+    model_error_of: str  # what these are shares of, and on which mesh
 
 
 def report_path() -> Path:
@@ -72,7 +82,7 @@ def choose_tissue(task: Task, name: str, report: Path | None = None) -> Choice |
     if not task.scene.vessel:
         return None
     path = report or report_path()
-    rows = _rows(path)
+    rows = _tissue_rows(path)
     choices = [_for_vessel(vessel, task.solver, rows, name, path) for vessel in task.scene.vessel]
     return min(choices, key=lambda choice: choice.tolerance_mN)
 
@@ -95,15 +105,29 @@ def overfull(task: Task, choice: Choice | None) -> str:
     )
 
 
-def thread_method(thread: ThreadSpec | None) -> dict[str, Any] | None:
-    """What moves a scene's thread, in words and numbers; None where no thread is."""
+def thread_method(thread: ThreadSpec | None, report: Path | None = None) -> dict[str, Any] | None:
+    """What moves a scene's thread, in words and numbers; None where no thread is.
+
+    Of ``report`` as in :func:`choose_tissue`, the row with the nearest number of links. Raises ConfigError likewise.
+    """
     if thread is None:
         return None
+    links = round(thread.length_mm / thread.link_mm)
+    path = report or report_path()
+    rows = _rows(path, lambda row: (row["case"], row["method"]) == (THREAD_CASE, THREAD_METHOD))
+    nearest = min(rows, key=lambda row: max(row["size"] / links, links / row["size"]), default=None)
     return {
         "method": "follow the leader",
-        "links": round(thread.length_mm / thread.link_mm),
+        "links": links,
         "link_mm": thread.link_mm,
         "source": "Brown et al. 2001, section 4; keeps lengths exactly, so it has no setting",
+        "model": "geometric and quasi-static: no weight, no inertia, no bending stiffness",
+        "measured_ms": None if nearest is None else nearest["median_ms"],
+        "model_error": None if nearest is None else nearest["error"],
+        "model_error_of": "model: not measured"
+        if nearest is None
+        else "model: largest distance of a node from a dynamic thread of 100 mm that is led the same way, over its "
+        f"length; {path.name}, '{THREAD_CASE}', {nearest['size']} links",
     }
 
 
@@ -117,17 +141,22 @@ def region_method(anatomy: AnatomySpec | None) -> dict[str, Any] | None:
     }
 
 
-def _rows(path: Path) -> list[dict[str, Any]]:
-    """The rows of the case that converged to a force, with errors in radii of the vessel. Raises ConfigError."""
+def _rows(path: Path, wanted: Callable[[dict[str, Any]], bool]) -> list[dict[str, Any]]:
+    """The rows of a report that are ``wanted``. Raises ConfigError."""
     try:
-        rows = [
-            row
-            for row in json.loads(config.read_text(path))["rows"]
-            if row["case"] == CASE and row["status"] == "converged" and "radii" in row["error_of"]
-            if FORCE.search(row["setting"])
-        ]
+        return [row for row in json.loads(config.read_text(path))["rows"] if wanted(row)]
     except (json.JSONDecodeError, KeyError, TypeError):
         raise ConfigError(f"{path}: not a report; `trainer bench speed-error` writes one") from None
+
+
+def _tissue_rows(path: Path) -> list[dict[str, Any]]:
+    """The rows of the case that converged to a force, with errors in radii of the vessel. Raises ConfigError."""
+
+    def like_a_task(row: dict[str, Any]) -> bool:
+        of_radii = row["case"] == CASE and row["status"] == "converged" and "radii" in row["error_of"]
+        return of_radii and FORCE.search(row["setting"]) is not None
+
+    rows = _rows(path, like_a_task)
     if not any(row["method"] in RUNNABLE for row in rows):
         raise ConfigError(
             f"{path}: no {' or '.join(RUNNABLE)} converged in '{CASE}'; `trainer bench speed-error` measures it"
@@ -143,18 +172,38 @@ def _for_vessel(vessel: VesselSpec, budget: SolverSpec, rows: list[dict[str, Any
     source = f"{path.name}, '{CASE}', {nearest} nodes"
     here = [_measured(row, vessel) for row in rows if row["size"] == nearest]
     enough = [
-        m for m in here if m.measured_error_mm <= budget.node_error_mm and m.tolerance_mN <= budget.force_error_mN
+        m
+        for m in here
+        if m.measured_solver_error_mm <= budget.node_error_mm and m.tolerance_mN <= budget.force_error_mN
     ]
     able = [m for m in enough if m.method in RUNNABLE]
     if not able:
-        best = min((m for m in here if m.method in RUNNABLE), key=lambda m: m.measured_error_mm)
+        best = min((m for m in here if m.method in RUNNABLE), key=lambda m: m.measured_solver_error_mm)
         raise ConfigError(
             f"{name}: nothing that a scene can run on was measured to keep 'solver.node_error_mm' = "
             f"{budget.node_error_mm:g} with 'solver.force_error_mN' = {budget.force_error_mN:g}; the best is "
-            f"{best.measured_error_mm:.2g} mm with {best.tolerance_mN:.2g} mN ({best.method}: {source})"
+            f"{best.measured_solver_error_mm:.2g} mm with {best.tolerance_mN:.2g} mN ({best.method}: {source})"
         )
     chosen, cheapest = (min(group, key=lambda m: m.measured_ms) for group in (able, enough))
-    return Choice(**vars(chosen), budget=budget, source=source, cheapest=cheapest)
+    errors, of = _model_error(vessel, path)
+    return Choice(
+        **vars(chosen), budget=budget, source=source, cheapest=cheapest, model_error=errors, model_error_of=of
+    )
+
+
+def _model_error(vessel: VesselSpec, path: Path) -> tuple[dict[str, float], str]:
+    """Of a link mesh with as many nodes around as the vessel, or nearly, by load; and what it is of."""
+
+    def around(row: dict[str, Any]) -> int:
+        found = AROUND.fullmatch(row["setting"])
+        return 0 if found is None else int(found[1])
+
+    rows = _rows(path, lambda row: row["method"] == MESH and around(row) > 0)
+    if not rows:
+        return {}, "model: not measured"
+    nearest = min((around(row) for row in rows), key=lambda n: max(n / vessel.around, vessel.around / n))
+    here = [row for row in rows if around(row) == nearest]
+    return {row["case"]: row["error"] for row in here}, f"{here[0]['error_of']}; {path.name}, {nearest} nodes around"
 
 
 def _measured(row: dict[str, Any], vessel: VesselSpec) -> Measured:
@@ -167,6 +216,6 @@ def _measured(row: dict[str, Any], vessel: VesselSpec) -> Measured:
         setting=row["setting"],
         nodes=row["size"],
         measured_ms=row["median_ms"],
-        measured_error_mm=row["error"] * radius,
+        measured_solver_error_mm=row["error"] * radius,
         tolerance_mN=float(found[1]) * unit_mN / (BENCH_MODULUS_KPA * BENCH_WALL_MM * BENCH_RADIUS_MM),
     )

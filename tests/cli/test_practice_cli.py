@@ -73,7 +73,7 @@ def test_the_document_says_all_that_the_contract_asks(command_line: CommandLine,
     assert set(found["methods"]) == {"tissue", "thread", "region"}
     tissue = found["methods"]["tissue"]
     assert tissue == asdict(choose_tissue(curriculum.load_task(str(task)).task, str(task)))
-    assert tissue["measured_error_mm"] <= tissue["budget"]["node_error_mm"] == 0.003
+    assert tissue["measured_solver_error_mm"] <= tissue["budget"]["node_error_mm"] == 0.003
     assert (found["methods"]["thread"]["method"], found["methods"]["thread"]["links"]) == ("follow the leader", 100)
     rrd = db.parent / "recordings" / f"{found['session']}.rrd"
     assert found["recording"] == str(rrd)

@@ -15,7 +15,7 @@ from skfem.helpers import dot
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 from test_links import five_tetrahedra
 
-from trainer.anatomy.vessel import Vessel, _tetrahedra, build
+from trainer.anatomy.vessel import Vessel, build, wall_tetrahedra
 from trainer.config import Sourced
 from trainer.curriculum import VesselSpec
 from trainer.geometry import Array
@@ -160,7 +160,9 @@ def by_links(tube: Vessel) -> Array:
 def by_finite_elements(tube: Vessel, element: ElementTetP1 | ElementTetP2) -> Array:
     """Displacements (n, 3) of the same tetrahedra, filled with a linear elastic solid."""
     x = tube.mesh.rest
-    mesh = MeshTet(np.ascontiguousarray(x.T), np.ascontiguousarray(_tetrahedra(tube.spec.layers, tube.spec.around).T))
+    mesh = MeshTet(
+        np.ascontiguousarray(x.T), np.ascontiguousarray(wall_tetrahedra(tube.spec.layers, tube.spec.around).T)
+    )
     basis = Basis(mesh, ElementVector(element))
     stiffness = linear_elasticity(*lame_parameters(MODULUS_kPa, POISSON)).assemble(basis)
     inner = RADIUS_mm - tube.spec.wall_mm

@@ -95,7 +95,7 @@ def build(spec: VesselSpec) -> Vessel:
     radial = np.cos(clock)[:, None] * twelve + np.sin(clock)[:, None] * three
     rest = np.asarray(spec.cut_edge_mm) + axial[:, None] * axis + radius[:, None] * radial
 
-    links, stiffness = stiffness_from_modulus(rest, _tetrahedra(layers, around), spec.modulus_kPa.value)
+    links, stiffness = stiffness_from_modulus(rest, wall_tetrahedra(layers, around), spec.modulus_kPa.value)
     # A quad's corners (layer, j), (layer + 1, j), (layer + 1, j + 1), (layer, j + 1) turn about the outward normal
     # when axis, 12 and 3 o'clock form a left-handed frame.
     left_handed = float(np.dot(cross(axis, twelve), three)) < 0.0
@@ -234,7 +234,7 @@ def node_normals(x: Array, triangles: np.ndarray) -> Array:
     return np.asarray(np.divide(total, length, out=np.zeros_like(total), where=length > 0.0))
 
 
-def _tetrahedra(layers: int, around: int) -> np.ndarray:
+def wall_tetrahedra(layers: int, around: int) -> np.ndarray:
     """Five tetrahedra (t, 4) in each cell of the wall.
 
     Corners with an even sum of layer, hull and j carry all diagonals: they span the middle tetrahedron, and each odd

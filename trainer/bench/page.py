@@ -31,6 +31,7 @@ SUBJECTS = {
     "thread": Subject("A thread", "links", 5e-3),
     "contact": Subject("Contact search", "triangles or segments", 0.0),
     "volume": Subject("Volumes of elements", "elements", 0.0),
+    "model": Subject("What the link mesh gets wrong of a solid", "nodes", 0.1),
 }
 
 Rows = Mapping[str, Sequence[Row]]

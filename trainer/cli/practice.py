@@ -106,6 +106,7 @@ class _Session:
 
     asked: Asked
     tissue: Choice | None
+    thread: dict[str, Any] | None  # what moves it
     knee: Anatomy | None
     scene: Scene
     profile: ProfileFile
@@ -145,7 +146,7 @@ def _open(stack: ExitStack, asked: Asked, clock: Fast) -> _Session:
         recorder = stack.enter_context(closing(RecorderProcess()))
 
     from trainer.anatomy import library
-    from trainer.choice import choose_tissue, overfull
+    from trainer.choice import choose_tissue, overfull, thread_method
     from trainer.cli.warmup import announce, warm_up
     from trainer.clock import Realtime
     from trainer.drivers import open_driver
@@ -161,6 +162,7 @@ def _open(stack: ExitStack, asked: Asked, clock: Fast) -> _Session:
     tissue = choose_tissue(task, asked.task_file.path)
     if slow := overfull(task, tissue):
         typer.echo(f"{asked.task_file.path}: {slow}", err=True)
+    thread = thread_method(task.scene.thread)
     knee = library.of_task(task.scene.anatomy, asked.anatomy)
     if asked.recording_path is not None:
         _make_room(asked.recording_path)
@@ -187,7 +189,7 @@ def _open(stack: ExitStack, asked: Asked, clock: Fast) -> _Session:
     if published is not None:
         sinks.append(stack.enter_context(closing(IgtlinkSink(published.host, published.port, scene.tools))))
     log = stack.enter_context(closing(LogSink(asked.log_path, header)))
-    return _Session(asked, tissue, knee, scene, profile, driver, clock, log, recording, (*sinks, log), devices)
+    return _Session(asked, tissue, thread, knee, scene, profile, driver, clock, log, recording, (*sinks, log), devices)
 
 
 def _run(
@@ -216,7 +218,7 @@ def _run(
 
 def _finish(session: _Session) -> dict[str, Any]:
     """Score and seal the session; the document about it."""
-    from trainer.choice import region_method, thread_method
+    from trainer.choice import region_method
     from trainer.metrics.registry import score
     from trainer.reporting.wording import out_of_sight
 
@@ -247,7 +249,7 @@ def _finish(session: _Session) -> dict[str, Any]:
         "log": str(asked.log_path),
         "methods": {
             "tissue": None if session.tissue is None else asdict(session.tissue),
-            "thread": thread_method(task.scene.thread),
+            "thread": session.thread,
             "region": region_method(task.scene.anatomy),
         },
         "realtime": pace,
