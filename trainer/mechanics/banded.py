@@ -2,17 +2,18 @@
 
 A matrix whose entries lie within b of the diagonal needs n b² multiplications to factor and 2 n b to solve
 (Golub and Van Loan, Matrix Computations, section 4.3). The factor is kept by columns, and both substitutions take the
-three columns of a node at once: forwards they subtract multiples of contiguous stretches, backwards they sum products.
+six columns of two nodes at once: forwards they subtract multiples of contiguous stretches, backwards they sum products.
 
-The factor is kept in whole numbers of 16 bits, a unit for each column; a solve adds up in single precision. It is bound
-by the memory that it reads, and this is half of what single precision reads: two vessels' factors then stay in the
-cache of a core. A solve is right to about 1e-4 of its answer, and L D Lᵀ positive definite as ever: a base for
-iterations that measure their own residual, not an answer. It is computed in double precision where it has to be told
-whether the matrix is singular, and in single precision, which takes half as long, where that is known.
+The factor is kept in whole numbers of 8 bits; a solve adds up in single precision. It is bound by the memory that it
+reads, and this is a quarter of what single precision reads: two vessels' factors then stay in the cache of a core,
+beside what else a tick needs. A solve is right to about a tenth of its answer, and L D Lᵀ positive definite as ever: a
+base for iterations that measure their own residual, not an answer. It is computed in double precision where it has to
+be told whether the matrix is singular, and in single precision, which takes half as long, where that is known.
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -24,19 +25,26 @@ from trainer.geometry import Array
 SINGULAR = 1e-9
 #: Columns that the factorisation subtracts from a later one at once.
 GROUP = 4
+#: Columns that the substitutions take at once: those of two nodes.
+BLOCK = 6
 #: The substitutions' loops run over multiples of this many numbers, with none left over.
 STRETCH = 32
-#: The largest number in a column of a kept factor.
-LARGEST = 32767.0
+#: The largest number of a kept factor.
+LARGEST = 127.0
 
 
 class BandedFactor(NamedTuple):
-    """L and D of K = L D Lᵀ for the nodes ``order``; the unknown 3 p + c is component c of node ``order[p]``."""
+    """L and D of K = L D Lᵀ for the nodes ``order``; the unknown 3 p + c is component c of node ``order[p]``.
+
+    By blocks of BLOCK columns: on the diagonal L has identities, D square matrices. For an odd node the last block is
+    filled up with the identity.
+    """
 
     order: np.ndarray  # (f,) int32 nodes, in the order of elimination
-    columns: np.ndarray  # (3 f, b) int16, L[j + 1 + k, j] in units of …
-    unit: np.ndarray  # (3 f,) float32, of a column
-    inverse: Array  # (3 f,) 1 / D[j]
+    below: np.ndarray  # (n, BLOCK, r) int8, by columns, the r rows of L below a block, in units of …
+    unit: np.ndarray  # (n, BLOCK) float32, of a column, times …
+    share: np.ndarray  # (r,) float32, of a row below its block
+    inverse: np.ndarray  # (n, BLOCK, BLOCK) float32, D⁻¹
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -59,23 +67,16 @@ def assemble_band(blocks: Array, links: np.ndarray, place: np.ndarray, band: np.
                     band[3 * low + c, 3 * (high - low) + r - c] -= blocks[e, r, c]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def factor_band(
-    band: np.ndarray,
-    diagonal: Array,
-    columns: np.ndarray,
-    unit: np.ndarray,
-    inverse: Array,
-    least: float,
-) -> int:
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def factor_band(band: np.ndarray, diagonal: Array, inverse: Array, least: float) -> int:
     """L D Lᵀ, L with unit diagonal, column by column from those before it (left-looking).
 
     ``band`` (3 f, b + 1 + GROUP) holds K as in :func:`assemble_band`, with zeros in its last columns, and is
-    overwritten with D Lᵀ. ``columns[j, k]`` times ``unit[j]`` is L[j + 1 + k, j], ``inverse[j]`` is 1 / D[j]. A pivot
-    that is below the share ``least`` of ``diagonal`` (3 f,), the band's own before, is replaced by it, so that the rest
-    stays finite. Returns how often that was done: unless it is 0, the factor is that of another matrix.
+    overwritten with D Lᵀ; ``inverse[j]`` is 1 / D[j]. A pivot that is below the share ``least`` of ``diagonal`` (3 f,),
+    the band's own before, is replaced by it, so that the rest stays finite. Returns how often that was done: unless it
+    is 0, the factor is that of another matrix.
     """
-    n, b = columns.shape
+    n, b = len(band), band.shape[1] - 1 - GROUP
     number = band.dtype.type
     replaced = 0
     for j in range(n):
@@ -105,65 +106,139 @@ def factor_band(
             pivot = diagonal[j]
             replaced += 1
         inverse[j] = 1.0 / pivot
-        largest = 0.0
-        for k in range(1, size):
-            largest = max(largest, abs(band[j, k] * inverse[j]))
-        unit[j] = largest / LARGEST
-        if unit[j] == 0.0:
-            unit[j] = 1.0
-        for k in range(1, size):
-            columns[j, k - 1] = round(band[j, k] * inverse[j] / unit[j])
     return replaced
 
 
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def join_columns(band: np.ndarray, inverse: Array, kept: BandedFactor) -> None:
+    """From single columns to blocks of them: with the triangle C of a block's own columns and their D, C D Cᵀ is the
+    block of D on the diagonal, and what is below is multiplied by C⁻¹.
+
+    ``band`` has D Lᵀ, and is left with the rows below a block from ``band[j, BLOCK - j % BLOCK]`` on.
+    """
+    r = len(kept.share)
+    for j in range(len(band)):
+        band[j] *= inverse[j]
+    for p in range(len(kept.below)):
+        first = BLOCK * p
+        size = min(BLOCK, len(band) - first)
+        for m in range(size - 2, -1, -1):
+            for other in range(m + 1, size):
+                multiplier = band[first + m, other - m]
+                source = band[first + other, BLOCK - other : BLOCK - other + r]
+                target = band[first + m, BLOCK - m : BLOCK - m + r]
+                for k in range(r):
+                    target[k] -= multiplier * source[k]
+        for e in range(BLOCK):  # the block's inverse, (C D Cᵀ)⁻¹, by its columns
+            x = kept.inverse[p, e]
+            x[:] = 0.0
+            x[e] = 1.0
+            for m in range(size):
+                for other in range(m + 1, size):
+                    x[other] -= band[first + m, other - m] * x[m]
+            for m in range(size):
+                x[m] *= inverse[first + m]
+            for m in range(size - 2, -1, -1):
+                for other in range(m + 1, size):
+                    x[m] -= band[first + m, other - m] * x[other]
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
-def substitute_forwards(columns: np.ndarray, unit: np.ndarray, inverse: Array, v: np.ndarray) -> None:
-    """Overwrites ``v`` (3 f,) float32 with D⁻¹ L⁻¹ v."""
-    n, b = columns.shape
-    for j in range(0, n, 3):
-        a0 = v[j] * unit[j]
-        v[j + 1] -= a0 * np.float32(columns[j, 0])
-        a1 = v[j + 1] * unit[j + 1]
-        v[j + 2] -= a0 * np.float32(columns[j, 1]) + a1 * np.float32(columns[j + 1, 0])
-        a2 = v[j + 2] * unit[j + 2]
-        below = n - 3 - j
-        reach = min(b - 2, below)
-        c0, c1, c2 = columns[j, 2 : 2 + reach], columns[j + 1, 1 : 1 + reach], columns[j + 2, :reach]
-        target = v[j + 3 : j + 3 + reach]
-        for k in range(reach):
-            target[k] -= a0 * np.float32(c0[k]) + a1 * np.float32(c1[k]) + a2 * np.float32(c2[k])
-        if reach < below:  # the second and third columns reach one and two rows further
-            v[j + 3 + reach] -= a1 * np.float32(columns[j + 1, 1 + reach]) + a2 * np.float32(columns[j + 2, reach])
-        if reach + 1 < below:
-            v[j + 4 + reach] -= a2 * np.float32(columns[j + 2, 1 + reach])
-    for j in range(n):
-        v[j] *= inverse[j]
+def round_number(rows: np.ndarray, k: int, to_whole: float, lost: float, whole: np.ndarray) -> float:
+    """One of a column's ``rows``, and what was ``lost`` above it, to a ``whole`` number; returns what is lost now."""
+    exact = to_whole * rows[k] + lost
+    rounded = min(max(np.rint(exact), -LARGEST), LARGEST) if rows[k] != 0.0 else 0.0
+    whole[k] = rounded
+    return float(exact - rounded)
 
 
-# The compiler may reorder these sums: they do not vectorise otherwise, and the factor would have to be
-# kept by rows as well. The order is fixed when it is compiled, so results are still the same bits in every run.
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc"})
-def substitute_backwards(columns: np.ndarray, unit: np.ndarray, v: np.ndarray) -> None:
-    """Overwrites ``v`` (3 f,) float32 with L⁻ᵀ v."""
-    n, b = columns.shape
-    for j in range(n - 3, -1, -3):
-        below = n - 3 - j
-        reach = min(b - 2, below)
-        c0, c1, c2 = columns[j, 2 : 2 + reach], columns[j + 1, 1 : 1 + reach], columns[j + 2, :reach]
-        known = v[j + 3 : j + 3 + reach]
-        s0 = s1 = s2 = np.float32(0.0)
-        for k in range(reach):
-            s0 += np.float32(c0[k]) * known[k]
-            s1 += np.float32(c1[k]) * known[k]
-            s2 += np.float32(c2[k]) * known[k]
-        if reach < below:
-            s1 += np.float32(columns[j + 1, 1 + reach]) * v[j + 3 + reach]
-            s2 += np.float32(columns[j + 2, reach]) * v[j + 3 + reach]
-        if reach + 1 < below:
-            s2 += np.float32(columns[j + 2, 1 + reach]) * v[j + 4 + reach]
-        v[j + 2] -= unit[j + 2] * s2
-        v[j + 1] -= unit[j + 1] * (s1 + np.float32(columns[j + 1, 0]) * v[j + 2])
-        v[j] -= unit[j] * (s0 + np.float32(columns[j, 0]) * v[j + 1] + np.float32(columns[j, 1]) * v[j + 2])
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"nnan", "nsz"})
+def round_columns(band: np.ndarray, per: Array, kept: BandedFactor) -> None:
+    """What :func:`join_columns` left in ``band`` to 8 bits, into ``kept``. Overwrites ``band`` and ``per`` (r,).
+
+    Numbers in the middle of a column are small, because its own ring of nodes and the next are at its ends: the rows'
+    shares even out what all columns have in common. What rounding takes from a number is added to the same component
+    of the next node. Their sum is then right, and so are forces on displacements that are nearly one for nodes nearby:
+    to those the matrix is softest, and errors count most.
+    """
+    share, r = kept.share, len(kept.share)
+    share[:] = np.float32(1e-12)
+    for j in range(len(band)):
+        rows = band[j, BLOCK - j % BLOCK : BLOCK - j % BLOCK + r]
+        for k in range(r):
+            share[k] += rows[k] * rows[k]
+    for k in range(r):
+        share[k] = math.sqrt(math.sqrt(share[k]))
+        per[k] = 1.0 / share[k]
+    for j in range(len(band)):
+        p, m = j // BLOCK, j % BLOCK
+        rows, whole = band[j, BLOCK - m : BLOCK - m + r], kept.below[p, m]
+        largest = 1e-30
+        for k in range(r):
+            rows[k] *= per[k]
+            largest = max(largest, abs(rows[k]))
+        kept.unit[p, m] = largest / LARGEST
+        to_whole = LARGEST / largest
+        lost0 = lost1 = lost2 = 0.0
+        for k in range(0, r - 2, 3):
+            lost0 = round_number(rows, k, to_whole, lost0 * per[k], whole) / per[k]
+            lost1 = round_number(rows, k + 1, to_whole, lost1 * per[k + 1], whole) / per[k + 1]
+            lost2 = round_number(rows, k + 2, to_whole, lost2 * per[k + 2], whole) / per[k + 2]
+
+
+# The compiler may contract a product and a sum to one operation, which leaves out a rounding …
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def substitute_forwards(kept: BandedFactor, v: np.ndarray) -> None:
+    """Overwrites ``v`` (BLOCK n + r,) float32 with L⁻¹ v; its last r are zero, and stay so."""
+    share = kept.share
+    r = len(share)
+    for p in range(len(kept.below)):
+        c, unit = kept.below[p], kept.unit[p]
+        own, target = v[BLOCK * p : BLOCK * p + BLOCK], v[BLOCK * p + BLOCK : BLOCK * p + BLOCK + r]
+        a0, a1, a2 = own[0] * unit[0], own[1] * unit[1], own[2] * unit[2]
+        a3, a4, a5 = own[3] * unit[3], own[4] * unit[4], own[5] * unit[5]
+        c0, c1, c2, c3, c4, c5 = c[0], c[1], c[2], c[3], c[4], c[5]
+        for k in range(r):
+            target[k] -= share[k] * (
+                a0 * np.float32(c0[k])
+                + a1 * np.float32(c1[k])
+                + a2 * np.float32(c2[k])
+                + a3 * np.float32(c3[k])
+                + a4 * np.float32(c4[k])
+                + a5 * np.float32(c5[k])
+            )
+
+
+# … and reorder these sums: they do not vectorise otherwise, and the factor would have to be kept by rows as well. What
+# it makes of it is fixed when it is compiled, so results are still the same bits in every run.
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
+def substitute_backwards(kept: BandedFactor, v: np.ndarray) -> None:
+    """Overwrites ``v`` (BLOCK n + r,) float32 with L⁻ᵀ D⁻¹ v; its last r are zero, and stay so."""
+    share = kept.share
+    r = len(share)
+    for p in range(len(kept.below) - 1, -1, -1):
+        c, unit, inverse = kept.below[p], kept.unit[p], kept.inverse[p]
+        own, known = v[BLOCK * p : BLOCK * p + BLOCK], v[BLOCK * p + BLOCK : BLOCK * p + BLOCK + r]
+        c0, c1, c2, c3, c4, c5 = c[0], c[1], c[2], c[3], c[4], c[5]
+        s0 = s1 = s2 = s3 = s4 = s5 = np.float32(0.0)
+        for k in range(r):
+            x = share[k] * known[k]
+            s0 += np.float32(c0[k]) * x
+            s1 += np.float32(c1[k]) * x
+            s2 += np.float32(c2[k]) * x
+            s3 += np.float32(c3[k]) * x
+            s4 += np.float32(c4[k]) * x
+            s5 += np.float32(c5[k]) * x
+        o0, o1, o2, o3, o4, o5 = own[0], own[1], own[2], own[3], own[4], own[5]
+        for m in range(BLOCK):
+            i = inverse[m]
+            own[m] = i[0] * o0 + i[1] * o1 + i[2] * o2 + i[3] * o3 + i[4] * o4 + i[5] * o5
+        own[0] -= unit[0] * s0
+        own[1] -= unit[1] * s1
+        own[2] -= unit[2] * s2
+        own[3] -= unit[3] * s3
+        own[4] -= unit[4] * s4
+        own[5] -= unit[5] * s5
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -176,7 +251,7 @@ def gather(values: Array, order: np.ndarray, v: np.ndarray) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def scatter(v: np.ndarray, order: np.ndarray, values: Array) -> None:
+def scatter(v: np.ndarray, order: np.ndarray, values: np.ndarray) -> None:
     """The rows ``order`` of ``values`` (n, 3) take ``v`` (3 f,)."""
     for p in range(len(order)):
         node = np.uintp(order[p])
@@ -185,16 +260,23 @@ def scatter(v: np.ndarray, order: np.ndarray, values: Array) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def solve(kept: BandedFactor, values: Array, v: np.ndarray, out: Array) -> None:
+def solve(kept: BandedFactor, values: Array, v: np.ndarray, out: np.ndarray) -> None:
     """K⁻¹ of the forces ``values`` (n, 3) mN on the factor's nodes into the same rows of ``out`` (n, 3) mm.
 
-    Overwrites ``v``, at least (3 f,) float32.
+    Overwrites ``v`` float32, at least as long as :func:`scratch` makes it.
     """
-    u = v[: len(kept.inverse)]
+    unknowns = 3 * len(kept.order)
+    u = v[: BLOCK * len(kept.below) + len(kept.share)]
     gather(values, kept.order, u)
-    substitute_forwards(kept.columns, kept.unit, kept.inverse, u)
-    substitute_backwards(kept.columns, kept.unit, u)
+    u[unknowns:] = np.float32(0.0)
+    substitute_forwards(kept, u)
+    substitute_backwards(kept, u)
     scatter(u, kept.order, out)
+
+
+def scratch(factors: list[BandedFactor]) -> np.ndarray:
+    """What :func:`solve` overwrites, for any of the ``factors``."""
+    return np.full(max(BLOCK * len(kept.below) + len(kept.share) for kept in factors), np.float32(0.0))
 
 
 class Band(NamedTuple):
@@ -204,6 +286,8 @@ class Band(NamedTuple):
     place: np.ndarray  # (n,) int32, a node's position in the order of elimination, or -1
     values: np.ndarray  # (3 f, b + 1 + GROUP) float32 or float64
     diagonal: Array  # (3 f,)
+    inverse: Array  # (3 f,)
+    per_share: Array  # (r,), see BandedFactor
 
 
 def room(links: np.ndarray, order: np.ndarray, node_count: int, number: type[np.floating]) -> tuple[Band, BandedFactor]:
@@ -214,13 +298,16 @@ def room(links: np.ndarray, order: np.ndarray, node_count: int, number: type[np.
     ends = place[links]
     ends = ends[np.all(ends >= 0, axis=1)]
     reach = int(np.max(np.abs(ends[:, 1] - ends[:, 0]), initial=0))
-    size = 3 * len(order)
-    b = STRETCH * -(-3 * reach // STRETCH) + 2
+    size, n = 3 * len(order), -(-3 * len(order) // BLOCK)
+    r = STRETCH * -(-3 * reach // STRETCH)
+    b = r + 2  # the first row of a node has two more of its own
     # Written now: a page of memory that is touched for the first time costs time, milliseconds for these.
-    band = Band(np.ascontiguousarray(links), place, np.full((size, b + 1 + GROUP), number(0.0)), np.zeros(size))
-    columns = np.full((size, b), 0, dtype=np.int16)
-    unit = np.full(size, 1.0, dtype=np.float32)
-    return band, BandedFactor(np.ascontiguousarray(order, dtype=np.int32), columns, unit, np.zeros(size))
+    values = np.full((size, b + 1 + GROUP), number(0.0))
+    band = Band(np.ascontiguousarray(links), place, values, np.zeros(size), np.zeros(size), np.zeros(r))
+    below = np.full((n, BLOCK, r), np.int8(0))
+    unit, share = np.full((n, BLOCK), np.float32(1.0)), np.full(r, np.float32(1.0))
+    inverse = np.full((n, BLOCK, BLOCK), np.float32(0.0))
+    return band, BandedFactor(np.ascontiguousarray(order, dtype=np.int32), below, unit, share, inverse)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -230,7 +317,10 @@ def factor_blocks(blocks: Array, band: Band, out: BandedFactor, least: float) ->
     band.values[:] = 0.0
     assemble_band(blocks, band.links, band.place, band.values)
     band.diagonal[:] = band.values[:, 0]
-    return factor_band(band.values, band.diagonal, out.columns, out.unit, out.inverse, least)
+    replaced = factor_band(band.values, band.diagonal, band.inverse, least)
+    join_columns(band.values, band.inverse, out)
+    round_columns(band.values, band.per_share, out)
+    return replaced
 
 
 def factor(blocks: Array, links: np.ndarray, order: np.ndarray, node_count: int) -> BandedFactor:

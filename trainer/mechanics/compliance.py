@@ -72,15 +72,14 @@ class Compliance:
         ]
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="factor", initializer=_give_way)
         self._thread.submit(_begin)  # a thread that began now is there when a session places its threads
-        unknowns = 3 * max(len(order) for order in orders)
-        self._push, self._v = np.zeros((n, 3)), np.zeros(unknowns, dtype=np.float32)
+        self._push, self._v = np.zeros((n, 3)), banded.scratch(self.factors)
         self._thread_push, self._thread_v = self._push.copy(), self._v.copy()
         self._free: list[int] = []
         self.slot_nodes = np.zeros((0, 3), dtype=np.int64)
         self.slot_weights = np.zeros((0, 3))
         self.slot_body: list[int] = []  # FREE for a slot that is
         self.slot_range = np.zeros((0, 2), dtype=np.int64)  # rows of the nodes of the slot's body
-        self.columns = np.zeros((0, 3, n, 3))  # K⁻¹ Wᵀ, mm per mN
+        self.columns = np.zeros((0, 3, n, 3), dtype=np.float32)  # K⁻¹ Wᵀ, mm/mN
         self._next_columns = self.columns
         self.matrix = np.zeros((0, 0))  # W K⁻¹ Wᵀ over all slots
         self._age = [LASTS] * len(orders)  # how many solves ago each body's factor was made
@@ -211,7 +210,7 @@ def _give_way() -> None:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def answers(
-    nodes: np.ndarray, weights: Array, factor: banded.BandedFactor, push: Array, v: np.ndarray, out: Array
+    nodes: np.ndarray, weights: Array, factor: banded.BandedFactor, push: Array, v: np.ndarray, out: np.ndarray
 ) -> None:
     """The displacements ``out`` (3, n, 3) of all nodes by a unit force along x, y and z on the mean of ``nodes`` (3,)
     with ``weights`` (3,). ``push`` (n, 3) is zero, and is left so; overwrites ``v``, see :func:`banded.solve`."""
@@ -238,7 +237,7 @@ def renew(
     weights: Array,
     push: Array,
     v: np.ndarray,
-    columns: Array,
+    columns: np.ndarray,
 ) -> None:
     """A body's ``factor`` at ``x`` (n, 3), and the ``columns`` (slots, 3, n, 3) of the points in ``slots`` (k,)."""
     link_blocks(x, links, rest_length, stiffness, False, blocks)

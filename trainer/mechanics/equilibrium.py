@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from trainer.geometry import Array
+from trainer.mechanics import banded
 from trainer.mechanics.attachments import Anchors, Cable, Frictions, Rows, fill, lay_out
 from trainer.mechanics.compliance import FREE, Compliance
 from trainer.mechanics.links import LinkMesh
@@ -78,18 +79,20 @@ class Equilibrium:
             longest_step=float(np.median(mesh.rest_length)),
         )
         self._memory = Memory(
-            s=np.zeros((PAIRS, n, 3)),
-            y=np.zeros((PAIRS, n, 3)),
+            s=np.zeros((PAIRS, n, 3), dtype=np.float32),
+            y=np.zeros((PAIRS, n, 3), dtype=np.float32),
             product=np.zeros((bodies, PAIRS)),
             newest=np.zeros(bodies, dtype=np.int64),
             known=np.zeros(bodies, dtype=np.int64),
+            at=np.full((n, 3), np.nan),
+            energy=np.zeros(bodies),
             force=np.zeros((n, 3)),
             old_force=np.zeros((n, 3)),
             g=np.zeros((n, 3)),
             q=np.zeros((n, 3)),
             z=np.zeros((n, 3)),
             trial=mesh.rest.copy(),
-            v=np.zeros(3 * max(len(order) for order in orders), dtype=np.float32),
+            v=banded.scratch(held.factors),
         )
         self._at_rest = [True] * bodies
         self._last_target: dict[int, list[float]] = {}

@@ -17,14 +17,15 @@ from trainer.mechanics import banded
 from trainer.mechanics.attachments import Rows, pull, tension_of
 from trainer.mechanics.links import add_forces
 from trainer.mechanics.quasi_newton import (
-    add_scaled,
     after_base,
     at_points,
     balance,
     before_base,
     dot,
     hold_base,
+    same,
     spread,
+    step_along,
 )
 
 #: A target further away than this, mm, is approached in steps of this size, so that the tissue follows its path …
@@ -59,7 +60,7 @@ class Base(NamedTuple):
     """The kept factors and how held points answer to forces; see Compliance."""
 
     factors: tuple[banded.BandedFactor, ...]
-    columns: Array  # (slots, 3, n, 3) mm/mN
+    columns: np.ndarray  # (slots, 3, n, 3) float32 mm/mN
     slot_range: np.ndarray  # (slots, 2) int64
     matrix: Array  # (3 slots, 3 slots) mm/mN
 
@@ -67,18 +68,20 @@ class Base(NamedTuple):
 class Memory(NamedTuple):
     """Each body's secant pairs in a ring, and scratch; all that is kept from one solve to the next."""
 
-    s: Array  # (pairs, n, 3) mm
-    y: Array  # (pairs, n, 3) mN
+    s: np.ndarray  # (pairs, n, 3) float32 mm; half the memory, and the cache is full of the factors
+    y: np.ndarray  # (pairs, n, 3) float32 mN
     product: Array  # (bodies, pairs) s · y
     newest: np.ndarray  # (bodies,) int64, the newest pair
     known: np.ndarray  # (bodies,) int64, how many there are; less than none: see use_pairs
-    force: Array  # (n, 3) mN, of the links at the last evaluation
+    at: Array  # (n, 3) mm, of the last evaluation; not a number before the first
+    energy: Array  # (bodies,) mN mm, of the links there …
+    force: Array  # (n, 3) mN, … and on their nodes
     old_force: Array  # (n, 3)
     g: Array  # (n, 3)
     q: Array  # (n, 3)
     z: Array  # (n, 3)
     trial: Array  # (n, 3)
-    v: np.ndarray  # (3 free nodes of the largest body,) float32
+    v: np.ndarray  # float32, see banded.solve
 
 
 class Held(NamedTuple):
@@ -119,9 +122,15 @@ def evaluate(x: Array, bodies: Bodies, rows: Rows, held: Held, memory: Memory) -
     """The energy at ``x`` (n, 3); leaves the nodes' elastic forces, the points' forces and their stiffness behind."""
     energy = 0.0
     for b in held.awake:
-        memory.force[bodies.nodes[b, 0] : bodies.nodes[b, 1]] = 0.0
-        first, last = bodies.span[b, 0], bodies.span[b, 1]
-        energy += add_forces(x, bodies.links, bodies.rest_length, bodies.stiffness, first, last, memory.force)
+        lo, hi = bodies.nodes[b, 0], bodies.nodes[b, 1]
+        if not same(x, memory.at, lo, hi):  # a solve begins where the last one ended
+            memory.at[lo:hi] = x[lo:hi]
+            memory.force[lo:hi] = 0.0
+            first, last = bodies.span[b, 0], bodies.span[b, 1]
+            memory.energy[b] = add_forces(
+                x, bodies.links, bodies.rest_length, bodies.stiffness, first, last, memory.force
+            )
+        energy += memory.energy[b]
     return energy + pull_points(x, rows, held)
 
 
@@ -261,6 +270,7 @@ def minimise(
     pull_points(x, rows, held)
     expect_taut(held)
     energy = evaluate(x, bodies, rows, held, memory)
+    width = largest(x, bodies, held)
     residual = gradient(bodies, held, memory)
     for iteration in range(max_iterations):
         if residual <= tolerance_mN:
@@ -292,12 +302,11 @@ def minimise(
         held_with = 0.0
         for i in range(len(held.force)):
             held_with += abs(held.force[i, 0]) + abs(held.force[i, 1]) + abs(held.force[i, 2])
-        noise = ROUNDING * (abs(energy) + largest(x, bodies, held) * held_with)
+        noise = ROUNDING * (abs(energy) + width * held_with)
         while True:
             for b in held.awake:
                 lo, hi = bodies.nodes[b, 0], bodies.nodes[b, 1]
-                memory.trial[lo:hi] = x[lo:hi]
-                add_scaled(-t, memory.z, memory.trial, lo, hi)
+                step_along(x, -t, memory.z, memory.trial, lo, hi)
             new_energy = evaluate(memory.trial, bodies, rows, held, memory)
             if new_energy <= energy - DECREASE * t * slope + noise:
                 break

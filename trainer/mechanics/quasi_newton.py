@@ -16,7 +16,9 @@ from trainer.mechanics.attachments import solve_dense
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def dot(a: Array, b: Array, first: int, last: int) -> float:
-    """Σ a_i · b_i over the rows ``first`` … ``last`` - 1 of two arrays (n, 3), summed in four strands."""
+    """Σ a_i · b_i over the rows ``first`` … ``last`` - 1 of two arrays (n, 3), summed in four strands.
+
+    Either may be of single precision; the sum is of double."""
     u, v = a[first:last].reshape(-1), b[first:last].reshape(-1)
     n = len(u)
     whole = n - n % 4
@@ -37,6 +39,24 @@ def add_scaled(a: float, source: Array, target: Array, first: int, last: int) ->
     u, v = source[first:last].reshape(-1), target[first:last].reshape(-1)
     for i in range(len(u)):
         v[i] += a * u[i]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def step_along(x: Array, a: float, way: Array, out: Array, first: int, last: int) -> None:
+    """``out`` = x + a way on the rows ``first`` … ``last`` - 1 of arrays (n, 3)."""
+    u, v, w = x[first:last].reshape(-1), way[first:last].reshape(-1), out[first:last].reshape(-1)
+    for i in range(len(u)):
+        w[i] = u[i] + a * v[i]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def same(a: Array, b: Array, first: int, last: int) -> bool:
+    """Whether the rows ``first`` … ``last`` - 1 of two arrays (n, 3) are equal, number for number."""
+    u, v = a[first:last].reshape(-1), b[first:last].reshape(-1)
+    different = 0
+    for i in range(len(u)):
+        different += u[i] != v[i]
+    return different == 0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -87,8 +107,8 @@ def multiply(matrix: Array, v: Array, out: Array) -> None:
 def before_base(
     q: Array,
     f: Array,
-    s: Array,
-    y: Array,
+    s: np.ndarray,
+    y: np.ndarray,
     product: Array,
     newest: np.ndarray,
     known: np.ndarray,
@@ -104,9 +124,9 @@ def before_base(
 ) -> None:
     """The first loop: overwrites the gradient, ``q`` (n, 3) at nodes and ``f`` (u, 3) at points, newest pair first.
 
-    ``s``, ``y`` (m, n, 3) hold each body's pairs, in the rows ``span`` (bodies, 2) of its nodes, in a ring that ends at
-    ``newest`` (bodies,) and has ``known`` (bodies,) in it; ``product`` (bodies, m) is s · y. What is held may join the
-    bodies ``awake``: their pairs of one age are taken as one. Overwrites ``moved``, ``pulled`` (m, u, 3),
+    ``s``, ``y`` (m, n, 3) float32 hold each body's pairs, in the rows ``span`` (bodies, 2) of its nodes, in a ring that
+    ends at ``newest`` (bodies,) and has ``known`` (bodies,) in it; ``product`` (bodies, m) is s · y. What is held may
+    join the bodies ``awake``: their pairs of one age are taken as one. Overwrites ``moved``, ``pulled`` (m, u, 3),
     ``curvature`` and ``share`` (m,), by age, for the second loop. A pair of no positive curvature is passed over.
     """
     pairs = len(s)
@@ -166,7 +186,7 @@ def hold_base(
     slots: np.ndarray,
     nodes: np.ndarray,
     weights: Array,
-    influence: Array,
+    influence: np.ndarray,
     slot_range: np.ndarray,
     compliance: Array,
     matrix: Array,
@@ -177,7 +197,7 @@ def hold_base(
     """Turns z = K⁻¹ q (n, 3) into (K + Wᵀ A W)⁻¹ (q + Wᵀ f) = z + K⁻¹ Wᵀ (f - (I + A C)⁻¹ A (W z + C f)), with
     C = W K⁻¹ Wᵀ.
 
-    ``influence`` (slots, 3, n, 3) holds the columns K⁻¹ Wᵀ, zero outside the rows ``slot_range`` (slots, 2);
+    ``influence`` (slots, 3, n, 3) float32 holds the columns K⁻¹ Wᵀ, zero outside the rows ``slot_range`` (slots, 2);
     ``compliance`` is C over all slots. Overwrites ``point``, ``answer`` (u, 3), ``system`` (3 u, 3 u).
     """
     u = len(slots)
@@ -203,8 +223,8 @@ def hold_base(
 @njit(cache=True, nogil=True, error_model="numpy")
 def after_base(
     z: Array,
-    s: Array,
-    y: Array,
+    s: np.ndarray,
+    y: np.ndarray,
     newest: np.ndarray,
     known: np.ndarray,
     nodes: np.ndarray,
