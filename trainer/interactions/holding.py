@@ -27,9 +27,9 @@ HOLD = 100.0
 TOLERANCE_MN = 1e-2
 #: A hold that resists every way alike.
 EVERY_WAY = np.eye(3)
-#: Iterations of one solve; the next movement goes on where it stopped. In a stitch 2 solves of 1000 end here. With 6 a
-#: wall that is pulled fast no longer tears: while it moves, its forces are never settled enough to be judged.
-MOST_ITERATIONS = 8
+#: Iterations of one solve; the next movement goes on where it stopped. In two stitches none of 5300 solves ended here.
+#: With 8 a wall that is pulled fast may no longer tear: while it moves, its forces are never settled enough.
+MOST_ITERATIONS = 12
 
 
 @dataclass(frozen=True)
