@@ -271,7 +271,7 @@ def test_a_law_that_is_constant_changes_nothing(kind: Kind) -> None:
 
 def tiny() -> Array:
     """Forces, and where all methods bring a mesh of a few nodes."""
-    mesh = block((2, 1, 1))
+    mesh = block((1, 1, 1))
     node = corner(mesh)
     x, branch = wandered(mesh)
     out = [np.zeros_like(x)]

@@ -179,7 +179,8 @@ def tension_of(e: int, elongation: float, stiffness: Array, branch: Branch | Non
 def potential_of(e: int, elongation: float, stiffness: Array, branch: Branch | None) -> float:
     """The integral, mN mm, of link ``e``'s tension from 0 to an elongation."""
     if branch is None:
-        return 0.5 * stiffness[e] * elongation * elongation
+        k: float = stiffness[e]
+        return 0.5 * k * elongation * elongation
     law = branch.law
     return potential(
         elongation, branch.slip[e], law.stiffness[e], law.growth[e], law.toe[e], law.loss[e], law.friction[e]
