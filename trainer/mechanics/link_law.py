@@ -1,7 +1,8 @@
 """The laws that a mesh's links may follow, one parameter for each link: constant, or shaped like a J (``link_tension``
 has the curve); and stiffness that prefers a direction.
 
-``replace(mesh, law=j_shaped(mesh, ...))`` is the same mesh with such links."""
+``replace(mesh, law=j_shaped(mesh, ...))`` is the same mesh with such links.
+"""
 
 from __future__ import annotations
 

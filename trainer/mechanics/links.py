@@ -40,7 +40,7 @@ class LinkMesh:
     start: np.ndarray  # (n + 1,) int32; node i has the entries start[i] … start[i + 1] of the next two
     neighbour: np.ndarray  # (2 m,) int32, the node at the other end
     via: np.ndarray  # (2 m,) int32, the link that leads there
-    law: LinkLaw | None = None  # of each link, see ``link_law``; None: the stiffness is constant
+    law: LinkLaw | None = None  # of the links, see ``link_law``; None: constant, all that ``equilibrium`` knows
 
 
 def link_mesh(rest: Array, links: np.ndarray, stiffness: Array, fixed: np.ndarray) -> LinkMesh:
@@ -187,8 +187,8 @@ def never_stretched(mesh: LinkMesh) -> Branch | None:
 def settle(mesh: LinkMesh, x: Array, branch: Branch | None) -> None:
     """The links remember that they came to rest at ``x`` (n, 3): from there some unload along another branch.
 
-    To be called after each equilibrium of a path whose links lose energy; none of the solves does it, so that a
-    movement may be tried and taken back.
+    To be called after each equilibrium of a path whose links lose energy. No solve does it, nor does
+    ``path_following``: a movement may be tried and taken back.
     """
     if branch is not None:
         keep_slip(x, mesh.links, mesh.rest_length, branch.law, branch.slip)

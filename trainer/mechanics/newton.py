@@ -5,6 +5,7 @@ nodes have moved by d, the first step is the tangent to the path of equilibria, 
 along with them. Where H is not positive definite, the smallest of a few multiples of the identity that makes it so is
 added, and the step leads down. Each further step is shortened until the energy falls (Armijo; Nocedal and Wright,
 Numerical Optimization, algorithms 3.1 and 3.3), so that the energy never rises but by rounding.
+Links with a law (``link_tension``) have kinks, between which the method is Newton's and at which the search holds it.
 
 Each system is factored anew by scipy's SuperLU: the reference for the others. ``krylov`` is for big meshes.
 """

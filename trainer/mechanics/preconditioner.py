@@ -107,7 +107,10 @@ class Preconditioner:
         self._answer()
 
     def update(self, x: Array, block: Array, branch: Branch | None = None) -> None:
-        """``block`` (m, 3, 3) becomes the stiffness at ``x`` (n, 3), and the factor near the held nodes is of it."""
+        """``block`` (m, 3, 3) becomes the stiffness at ``x`` (n, 3), and the factor near the held nodes is of it.
+
+        ``branch`` says where on their law the links are, if the mesh has one: here and above.
+        """
         m = self.mesh
         link_blocks(x, m.links, m.rest_length, m.stiffness, False, block, branch)
         if not self._near.compute(block):
