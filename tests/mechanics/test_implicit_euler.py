@@ -202,7 +202,7 @@ def test_held_nodes_are_met_exactly(newton_steps: int) -> None:
 
 
 def test_a_link_with_hysteresis_gives_back_what_it_stored() -> None:
-    """Drawn out by 1 mm and let go slowly by its held node, a link costs h U - (h T)² / (2 κ): see link_law.
+    """Drawn out by 1 mm and let go slowly by its held node, a link costs h U - (h T)² / (2 κ): see link_tension.
 
     The work of the held node is Σ T Δx over 1000 steps each way with the tension at the end of the step: of first
     order, and its error cancels but for h T'' terms: 2e-3 of the work.
