@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ from swinging import FREQUENCY, MASS, STIFFNESS, WEIGHTLESS, block, in_motion, s
 from trainer.mechanics.dynamics import at_rest, mechanical_energy, model
 from trainer.mechanics.implicit_euler import BackwardEuler, linearise, multiply, residual
 from trainer.mechanics.integrators import RK4, Explicit
-from trainer.mechanics.link_law import area, j_shaped
+from trainer.mechanics.link_law import j_shaped
+from trainer.mechanics.link_tension import area
 from trainer.mechanics.links import forces, hessian, link_mesh
 
 #: Both of them: to the end of Newton's iteration, and the one linear step.
@@ -200,14 +202,14 @@ def test_held_nodes_are_met_exactly(newton_steps: int) -> None:
 
 
 def test_a_link_with_hysteresis_gives_back_what_it_stored() -> None:
-    """Drawn out by 1 mm and let go slowly by its held node, a link costs h U - (h T)² / (2 κ): see link_law.
+    """Drawn out by 1 mm and let go slowly by its held node, a link costs h U - (h T)² / (2 κ): see link_tension.
 
     The work of the held node is Σ T Δx over 1000 steps each way with the tension at the end of the step: of first
     order, and its error cancels but for h T'' terms: 2e-3 of the work.
     """
     mesh = spring()
     law = j_shaped(mesh, growth=20.0, toe_strain=0.2, loss=0.4)
-    made = model(mesh, np.full(2, MASS), law=law, gravity=WEIGHTLESS)
+    made = model(replace(mesh, law=law), np.full(2, MASS), gravity=WEIGHTLESS)
     state = at_rest(mesh)
     state.held[:] = True
     work, spent = BackwardEuler(made, tolerance_mN=1e-9), 0.0

@@ -7,6 +7,7 @@ import math
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -24,7 +25,8 @@ from trainer.mechanics.dynamics import (
 )
 from trainer.mechanics.implicit_euler import BackwardEuler
 from trainer.mechanics.integrators import FORWARD_EULER, METHODS, MIDPOINT, RK4, RK4_RADIUS, Explicit, Method
-from trainer.mechanics.link_law import constant, j_shaped, settle
+from trainer.mechanics.link_law import j_shaped
+from trainer.mechanics.link_tension import slip_at
 from trainer.mechanics.links import LinkMesh, link_mesh, stiffness_from_modulus
 
 #: R(z) = Σ z^k / k!, up to the method's order.
@@ -304,7 +306,7 @@ def heavy_case() -> tuple[Model, LinkMesh]:
     """Hysteresis, drag, dashpots and gravity together."""
     mesh, mass = block(fixed=True)
     law = j_shaped(mesh, growth=5.0, toe_strain=0.3, loss=0.3)
-    return model(mesh, mass, law=law, drag=2e3 * mass, dashpot=1e-6), mesh
+    return model(replace(mesh, law=law), mass, drag=2e3 * mass, dashpot=1e-6), mesh
 
 
 def outcome() -> str:
@@ -321,15 +323,15 @@ def outcome() -> str:
 
 @pytest.mark.parametrize("name", [*(m.name for m in METHODS), "backward Euler"])
 def test_links_remember_where_a_step_left_them(name: str) -> None:
-    """After one substep from slip 0 each link's slip is that of link_law at its new elongation, to the last digits."""
+    """After one substep from slip 0 each link's slip is that of its law at its new elongation, to the last digits."""
     made, mesh = heavy_case()
     explicit = {m.name: Explicit(made, m, mesh.fixed) for m in METHODS}
     work = explicit.get(name) or BackwardEuler(made, tolerance_mN=1e-6)
     state = in_motion(mesh)
     assert work.step(state, min(1e-6, work.stable_step_s)) == 1
     d = state.x[mesh.links[:, 1]] - state.x[mesh.links[:, 0]]
-    slip = np.zeros(len(d))
-    settle(made.law, np.linalg.norm(d, axis=1) - mesh.rest_length, slip)
+    elongation = np.linalg.norm(d, axis=1) - mesh.rest_length
+    slip = np.array([slip_at(*link) for link in zip(elongation, np.zeros(len(d)), *made.law, strict=True)])
     assert np.abs(slip).max() > 1e-7
     assert state.slip == pytest.approx(slip, abs=1e-14)
 
@@ -352,7 +354,7 @@ def test_without_compilation_the_result_is_the_same_bit_for_bit() -> None:
 def test_no_step_allocates_after_the_first() -> None:
     """The peak of traced memory in a step stays below half of one (n, 3) array; Python's own numbers fit into it."""
     mesh, mass = block(cells=5, fixed=True)
-    made = model(mesh, mass, law=constant(mesh), drag=2e3 * mass)
+    made = model(mesh, mass, drag=2e3 * mass)
     array = mesh.rest.nbytes
     for work in (*(Explicit(made, m, mesh.fixed) for m in METHODS), BackwardEuler(made, tolerance_mN=1e-6)):
         state = in_motion(mesh)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -13,23 +14,18 @@ from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from trainer.geometry import Array
-from trainer.mechanics.link_law import (
+from trainer.mechanics.link_law import j_shaped, moduli_along, steepest_tangent, stiffened_along
+from trainer.mechanics.link_tension import (
+    Branch,
     LinkLaw,
     area,
-    constant,
-    energies,
-    j_shaped,
     loading,
-    moduli_along,
-    settle,
+    potential,
     slip_at,
-    steepest_tangent,
-    stiffened_along,
     stored_energy,
     tension_and_tangent,
-    tensions,
 )
-from trainer.mechanics.links import LinkMesh, energy, forces, link_mesh
+from trainer.mechanics.links import LinkMesh, forces, link_mesh, settle
 
 REAL = Path(__file__).parents[3] / "shared/data/tissue/stress_strain_ascending.csv"
 
@@ -165,31 +161,36 @@ def test_no_tangent_is_steeper_than_the_steepest(law: tuple[float, ...], elongat
     assert tension <= steepest_tangent(flat)[0] * max(elongation, 0.0) * (1.0 + 1e-14)
 
 
-def test_the_constant_law_is_the_meshs_own() -> None:
-    """Tension and energy of links.forces and links.energy, to rounding."""
-    mesh = chain(4)
-    x = mesh.rest * np.array([1.3, 1.0, 1.0])
-    x[3, 0] -= 1.5
-    elongation = np.diff(x[:, 0]) - 2.0
-    tension, tangent, stored = (np.empty(3) for _ in range(3))
-    tensions(constant(mesh), elongation, np.zeros(3), tension, tangent)
-    energies(constant(mesh), elongation, np.zeros(3), stored)
-    assert np.cumsum(forces(mesh, x)[:-1, 0]) == pytest.approx(tension, rel=1e-14)
-    assert stored.sum() == pytest.approx(energy(mesh, x), rel=1e-14)
-    assert (tangent == 5.0).all()
+@given(law=laws, elongation=elongations, slip=elongations)
+@example(law=J, elongation=0.69, slip=0.5)
+def test_the_potential_is_the_tensions_integral(law: tuple[float, ...], elongation: float, slip: float) -> None:
+    """The tension never falls: a difference quotient of its integral lies between its values at both ends, and the
+    integral from 0 between its sums over the left and the right ends of 1000 parts.
+
+    Rounding: 20 units in the last place of potentials of up to κ/2 are 2e-15 κ, and 2e-10 of κ over 2 d.
+    """
+    d = 1e-5
+    up, down = (potential(elongation + s * d, slip, *law) for s in (1.0, -1.0))
+    above, below = (tension_and_tangent(elongation + s * d, slip, *law)[0] for s in (1.0, -1.0))
+    noise = 1e-9 * law[4]
+    assert below - noise <= (up - down) / (2.0 * d) <= above + noise
+    seen = np.array([tension_and_tangent(e, slip, *law)[0] for e in np.linspace(0.0, elongation, 1001)])
+    least, most = sorted(elongation / 1000 * float(part.sum()) for part in (seen[:-1], seen[1:]))
+    assert least - 1e-12 * law[4] <= potential(elongation, slip, *law) <= most + 1e-12 * law[4]
 
 
 def test_each_link_has_its_own_law() -> None:
     """Per link: the growth is one of strain, so a link of 2 mm has half of it per mm; the slip settles link by link."""
     mesh = chain(3)
     law = j_shaped(mesh, growth=np.array([0.0, 8.0]), toe_strain=0.25, loss=np.array([0.0, 0.5]))
-    elongation, slip = np.array([0.4, 0.4]), np.zeros(2)
-    tension, tangent = np.empty(2), np.empty(2)
-    tensions(law, elongation, slip, tension, tangent)
-    assert tension == pytest.approx([2.0, 5.0 / 4.0 * math.expm1(1.6)], rel=1e-14)
-    settle(law, elongation, slip)
-    assert slip[0] == 0.0
-    assert slip[1] == pytest.approx(0.4 - 0.5 * tension[1] / (5.0 * math.exp(2.0)), rel=1e-14)
+    mesh, x = replace(mesh, law=law), mesh.rest * np.array([1.2, 1.0, 1.0])
+    first, second = 2.0, 5.0 / 4.0 * math.expm1(1.6)
+    assert forces(mesh, x)[:, 0] == pytest.approx([first, second - first, -second], rel=1e-14)
+    branch = Branch(law, np.zeros(2))
+    settle(mesh, x, branch)
+    assert branch.slip[0] == 0.0
+    assert branch.slip[1] == pytest.approx(0.4 - 0.5 * second / (5.0 * math.exp(2.0)), rel=1e-14)
+    assert forces(mesh, 0.5 * (x + mesh.rest), branch)[2, 0] == pytest.approx(-0.5 * 1.25 * math.expm1(0.8), rel=1e-14)
 
 
 @pytest.mark.parametrize(

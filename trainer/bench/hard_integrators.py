@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -114,8 +115,8 @@ def toe_and_loss() -> tuple[Model, State]:
     mesh = two_tetrahedra(np.full(9, 0.1))
     state = at_rest(mesh)
     state.x[:] *= 2.0
-    law = j_shaped(mesh, growth=6.0, toe_strain=0.5, loss=0.33)
-    return model(mesh, np.full(5, 1e-4), law=law, drag=DRAG * 1e-4, gravity=WEIGHTLESS), state
+    mesh = replace(mesh, law=j_shaped(mesh, growth=6.0, toe_strain=0.5, loss=0.33))
+    return model(mesh, np.full(5, 1e-4), drag=DRAG * 1e-4, gravity=WEIGHTLESS), state
 
 
 def line(squeezed: bool) -> tuple[Model, State]:

@@ -32,7 +32,7 @@ from numba import njit
 
 from trainer.geometry import Array
 from trainer.mechanics.dynamics import Model, State, finite, refuse, settle_links
-from trainer.mechanics.link_law import tension_and_tangent
+from trainer.mechanics.link_tension import Branch, tension_of
 
 #: Newton's steps before the step in time is halved, and how often it may be.
 MOST_NEWTON_STEPS, MOST_HALVINGS = 30, 10
@@ -66,6 +66,7 @@ class Solve(NamedTuple):
 def residual(model: Model, state: State, v: Array, h: float, x: Array, r: Array) -> float:
     """Fills ``x`` (n, 3) and ``r`` (n, 3), zero at held nodes; returns |r| / h, mN."""
     law, old = model.law, state.x
+    branch = Branch(law, state.slip)
     for i in range(len(x)):
         for c in range(3):
             x[i, c] = old[i, c] + h * v[i, c]
@@ -75,10 +76,7 @@ def residual(model: Model, state: State, v: Array, h: float, x: Array, r: Array)
         dx, dy, dz = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
         length = math.sqrt(dx * dx + dy * dy + dz * dz)
         if length > 0.0:
-            tension, _ = tension_and_tangent(
-                length - model.rest_length[e], state.slip[e],
-                law.stiffness[e], law.growth[e], law.toe[e], law.loss[e], law.friction[e],
-            )  # fmt: skip
+            tension, _ = tension_of(e, length - model.rest_length[e], law.stiffness, branch)
             pull = h * tension / length
             for c in range(3):
                 along = pull * (x[j, c] - x[i, c])
@@ -118,6 +116,7 @@ def add_outer(along: float, across: float, dx: float, dy: float, dz: float, bloc
 def linearise(model: Model, state: State, x: Array, h: float, project: bool, block: Array, inverse: Array) -> None:
     """The links' blocks h² B + h b u uᵀ at ``x`` (n, 3), and the inverse of each node's own block."""
     law, old = model.law, state.x
+    branch = Branch(law, state.slip)
     block[:] = 0.0
     inverse[:] = 0.0
     for i in range(len(x)):
@@ -128,10 +127,7 @@ def linearise(model: Model, state: State, x: Array, h: float, project: bool, blo
         squared = dx * dx + dy * dy + dz * dz
         length = math.sqrt(squared)
         if length > 0.0:
-            tension, tangent = tension_and_tangent(
-                length - model.rest_length[e], state.slip[e],
-                law.stiffness[e], law.growth[e], law.toe[e], law.loss[e], law.friction[e],
-            )  # fmt: skip
+            tension, tangent = tension_of(e, length - model.rest_length[e], law.stiffness, branch)
             across = tension / length
             if project and across < 0.0:
                 across = 0.0

@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 
 from trainer.geometry import Array
-from trainer.mechanics.links import LinkMesh, add_forces
+from trainer.mechanics.links import LinkMesh, add_forces, never_stretched
 from trainer.mechanics.newton import Outcome, multiply, refuse_loose_nodes, refuse_not_finite
 from trainer.mechanics.preconditioner import Kept, Preconditioner, precondition
 from trainer.mechanics.quasi_newton import add_scaled, dot
@@ -58,6 +58,7 @@ class NewtonKrylov:
         self.x = mesh.rest.copy()
         self.iterations = 0  # of conjugate gradients, so far
         self.factors = 1  # made so far
+        self.branch = never_stretched(mesh)  # where on their law the links are; ``links.settle`` moves it
         self._base = Preconditioner(mesh)
         self._block = np.zeros((len(mesh.links), 3, 3))
         self._slow = False
@@ -131,8 +132,8 @@ class NewtonKrylov:
             self._slow = False
             self._spent = 0
             self.factors += 1
-            self._base.renew(self.x, self._block)
-        self._base.update(self.x, self._block)
+            self._base.renew(self.x, self._block, self.branch)
+        self._base.update(self.x, self._block, self.branch)
 
     def _predict(self, nodes: np.ndarray, places: Array, load: Array) -> float:
         """Moves the nodes, and all others along the tangent to the path of equilibria if that has less energy."""
@@ -173,7 +174,7 @@ class NewtonKrylov:
         """The energy at ``x`` (n, 3); ``force`` (n, 3) becomes what is unbalanced on the free nodes."""
         m = self.mesh
         force[:] = load
-        energy = add_forces(x, m.links, m.rest_length, m.stiffness, 0, len(m.links), force)
+        energy = add_forces(x, m.links, m.rest_length, m.stiffness, 0, len(m.links), force, self.branch)
         _zero(self._base.free, force)
         return float(energy - np.vdot(load, x))
 

@@ -1,49 +1,18 @@
-"""The tension of a link as a function of its elongation (Brown et al. 2001, section 3: "k_ij may be constant or a
-function of Δ_ij").
+"""The laws that a mesh's links may follow, one parameter for each link: constant, or shaped like a J (``link_tension``
+has the curve); and stiffness that prefers a direction.
 
-Soft tissue is slack at first and stiff later: its curve has the shape of a J. Here, after Fung (1967, Am. J. Physiol.
-213:1532, dT/dλ proportional to T plus a constant), a link that is longer than at rest by Δ > 0 is loaded along
-
-    T(Δ) = (k / β) (exp(β Δ) - 1)   up to the end of the toe, Δ = t, and from there along its tangent,
-
-and is an ordinary spring k when it is shortened. β = 0 is the constant stiffness.
-
-Unloading follows another branch, (1 - h) T. Between the two the link is a spring with a friction element beside it
-(Prandtl's element, with a limit that grows with the tension):
-
-    tension = (1 - h) T(Δ) + q,    q = κ (Δ - p) held between 0 and h T(Δ),    κ = k exp(β t),
-
-where the slip p is the link's only memory: it moves when q meets a limit. The energy stored is that of (1 - h) T, plus
-q² / (2 κ); what is lost in dp is q dp, and it is never negative, because p falls only where q = 0. κ is the steepest
-tangent of the loading branch, so that loading follows T itself from rest. A cycle to Δ and back to rest loses
-h U(Δ) - (h T(Δ))² / (2 κ), U being the area below T, at any speed: the branches do not depend on rates.
-
-Lengths mm, tension mN, stiffness mN/mm, energy mN mm.
+``replace(mesh, law=j_shaped(mesh, ...))`` is the same mesh with such links.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from trainer.geometry import Array, unit
+from trainer.mechanics.link_tension import LinkLaw
 from trainer.mechanics.links import LinkMesh
-
-#: Below this β Δ the energy is summed as a series: the closed form loses 2 / (β Δ)² units in the last place.
-SERIES = 0.5
-
-
-class LinkLaw(NamedTuple):
-    """One law per link, by its parameters."""
-
-    stiffness: Array  # (m,) mN/mm, k: the tangent at rest
-    growth: Array  # (m,) 1/mm, β: 0 is a constant stiffness
-    toe: Array  # (m,) mm, t: the elongation at which the curve becomes straight
-    loss: Array  # (m,) h, 0 <= h < 1: share of the tension that the unloading branch lacks
-    friction: Array  # (m,) mN/mm, κ: stiffness between the branches
 
 
 def constant(mesh: LinkMesh) -> LinkLaw:
@@ -110,101 +79,3 @@ def moduli_along(modulus_kPa: float, ratio: float) -> tuple[float, float]:
     d = c11 * (c22 + c23) - 2.0 * c12 * c12
     scale = 6.0 * modulus_kPa
     return scale * d / (c22 + c23), scale * (c22 - c23) * d / (c11 * c22 - c12 * c12)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def loading(elongation: float, k: float, growth: float, toe: float) -> tuple[float, float]:
-    """Tension T, mN, and tangent, mN/mm, of the loading branch."""
-    if growth == 0.0 or elongation <= 0.0:
-        return k * elongation, k
-    curved = min(elongation, toe)
-    more = math.expm1(growth * curved)
-    tangent = k * (1.0 + more)
-    return k * more / growth + tangent * (elongation - curved), tangent
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def area(elongation: float, k: float, growth: float, toe: float) -> float:
-    """The energy U, mN mm, below the loading branch.
-
-    In the toe U = k Δ² φ(β Δ) with φ(z) = (exp z - 1 - z) / z² = 1/2! + z/3! + z²/4! + …
-    """
-    if growth == 0.0 or elongation <= 0.0:
-        return 0.5 * k * elongation * elongation
-    curved = min(elongation, toe)
-    z = growth * curved
-    if z < SERIES:
-        phi, term, order = 0.5, 0.5, 3.0
-        while term > 1e-17:
-            term *= z / order
-            phi += term
-            order += 1.0
-    else:
-        phi = (math.expm1(z) - z) / (z * z)
-    tension, tangent = loading(curved, k, growth, toe)
-    beyond = elongation - curved
-    return k * curved * curved * phi + (tension + 0.5 * tangent * beyond) * beyond
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def tension_and_tangent(
-    elongation: float, slip: float, k: float, growth: float, toe: float, loss: float, friction: float
-) -> tuple[float, float]:
-    """Tension, mN, at an elongation when the slip was ``slip`` mm before, and its derivative, mN/mm."""
-    tension, tangent = loading(elongation, k, growth, toe)
-    if loss == 0.0 or elongation <= 0.0:
-        return tension, tangent
-    q = friction * (elongation - slip)
-    if q >= loss * tension:
-        return tension, tangent
-    if q <= 0.0:
-        return (1.0 - loss) * tension, (1.0 - loss) * tangent
-    return (1.0 - loss) * tension + q, (1.0 - loss) * tangent + friction
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def slip_at(elongation: float, slip: float, k: float, growth: float, toe: float, loss: float, friction: float) -> float:
-    """The slip, mm, that a link keeps when it comes to rest at an elongation, ``slip`` being that of before."""
-    if loss == 0.0:
-        return slip
-    tension, _ = loading(elongation, k, growth, toe)
-    return elongation - min(max(friction * (elongation - slip), 0.0), loss * max(tension, 0.0)) / friction
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def stored_energy(
-    elongation: float, slip: float, k: float, growth: float, toe: float, loss: float, friction: float
-) -> float:
-    """The energy, mN mm, that a link at an elongation can give back."""
-    whole = area(elongation, k, growth, toe)
-    if loss == 0.0 or elongation <= 0.0:
-        return whole
-    q = friction * (elongation - slip_at(elongation, slip, k, growth, toe, loss, friction))
-    return (1.0 - loss) * whole + 0.5 * q * q / friction
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def tensions(law: LinkLaw, elongation: Array, slip: Array, tension: Array, tangent: Array) -> None:
-    """Tension (m,) mN and tangent (m,) mN/mm of all links at ``elongation`` (m,) mm with ``slip`` (m,) mm before."""
-    for e in range(len(elongation)):
-        tension[e], tangent[e] = tension_and_tangent(
-            elongation[e], slip[e], law.stiffness[e], law.growth[e], law.toe[e], law.loss[e], law.friction[e]
-        )
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def energies(law: LinkLaw, elongation: Array, slip: Array, out: Array) -> None:
-    """Stored energy (m,) mN mm of all links."""
-    for e in range(len(elongation)):
-        out[e] = stored_energy(
-            elongation[e], slip[e], law.stiffness[e], law.growth[e], law.toe[e], law.loss[e], law.friction[e]
-        )
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def settle(law: LinkLaw, elongation: Array, slip: Array) -> None:
-    """Moves ``slip`` (m,) mm, in place, to where the links keep it at ``elongation`` (m,) mm."""
-    for e in range(len(elongation)):
-        slip[e] = slip_at(
-            elongation[e], slip[e], law.stiffness[e], law.growth[e], law.toe[e], law.loss[e], law.friction[e]
-        )

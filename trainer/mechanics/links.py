@@ -5,7 +5,12 @@ k (l - l0) mN along the unit vector u from i to j. Its energy is k (l - l0)² / 
 
     B = k [u uᵀ + (1 - l0 / l) (I - u uᵀ)],
 
-+B on the two diagonal blocks and -B on the two others. Lengths mm, stiffness mN/mm, energy mN mm.
++B on the two diagonal blocks and -B on the two others. Where the mesh has a law of its own (``link_tension``), the
+tension T stands for k (l - l0), its potential for the energy and its derivative for k:
+
+    B = T' u uᵀ + (T / l) (I - u uᵀ).
+
+Lengths mm, stiffness mN/mm, energy mN mm.
 """
 
 from __future__ import annotations
@@ -17,6 +22,7 @@ import numpy as np
 from numba import njit
 
 from trainer.geometry import Array
+from trainer.mechanics.link_tension import Branch, LinkLaw, potential_of, slip_at, tension_of
 
 #: The six edges of a tetrahedron, as pairs of its corners.
 TETRAHEDRON_EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
@@ -34,6 +40,7 @@ class LinkMesh:
     start: np.ndarray  # (n + 1,) int32; node i has the entries start[i] … start[i + 1] of the next two
     neighbour: np.ndarray  # (2 m,) int32, the node at the other end
     via: np.ndarray  # (2 m,) int32, the link that leads there
+    law: LinkLaw | None = None  # of the links, see ``link_law``; None: constant, all that ``equilibrium`` knows
 
 
 def link_mesh(rest: Array, links: np.ndarray, stiffness: Array, fixed: np.ndarray) -> LinkMesh:
@@ -89,7 +96,14 @@ def stiffness_from_modulus(rest: Array, tetrahedra: np.ndarray, modulus_kPa: flo
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def add_forces(
-    x: Array, links: np.ndarray, rest_length: Array, stiffness: Array, first: int, last: int, force: Array
+    x: Array,
+    links: np.ndarray,
+    rest_length: Array,
+    stiffness: Array,
+    first: int,
+    last: int,
+    force: Array,
+    branch: Branch | None = None,
 ) -> float:
     """Adds the forces of the links ``first`` … ``last`` - 1 to ``force`` (n, 3) mN; returns their energy, mN mm."""
     energy = 0.0
@@ -98,9 +112,10 @@ def add_forces(
         dx, dy, dz = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
         length = math.sqrt(dx * dx + dy * dy + dz * dz)
         stretch = length - rest_length[e]
-        energy += 0.5 * stiffness[e] * stretch * stretch
+        energy += potential_of(e, stretch, stiffness, branch)
         if length > 0.0:
-            pull = stiffness[e] * stretch / length
+            tension, _ = tension_of(e, stretch, stiffness, branch)
+            pull = tension / length
             force[i, 0] += pull * dx
             force[i, 1] += pull * dy
             force[i, 2] += pull * dz
@@ -111,7 +126,15 @@ def add_forces(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def link_blocks(x: Array, links: np.ndarray, rest_length: Array, stiffness: Array, project: bool, out: Array) -> None:
+def link_blocks(
+    x: Array,
+    links: np.ndarray,
+    rest_length: Array,
+    stiffness: Array,
+    project: bool,
+    out: Array,
+    branch: Branch | None = None,
+) -> None:
     """The block B of each link into ``out`` (m, 3, 3) mN/mm.
 
     With ``project`` the part across a shortened link, which is negative, is left out: B is then positive
@@ -124,10 +147,14 @@ def link_blocks(x: Array, links: np.ndarray, rest_length: Array, stiffness: Arra
         across = 0.0
         along = 0.0
         if length > 0.0:
-            across = stiffness[e] * (1.0 - rest_length[e] / length)
+            if branch is None:
+                tangent, across = stiffness[e], stiffness[e] * (1.0 - rest_length[e] / length)
+            else:
+                tension, tangent = tension_of(e, length - rest_length[e], stiffness, branch)
+                across = tension / length
             if project and across < 0.0:
                 across = 0.0
-            along = (stiffness[e] - across) / (length * length)
+            along = (tangent - across) / (length * length)
         out[e, 0, 0] = along * dx * dx + across
         out[e, 0, 1] = along * dx * dy
         out[e, 0, 2] = along * dx * dz
@@ -139,41 +166,75 @@ def link_blocks(x: Array, links: np.ndarray, rest_length: Array, stiffness: Arra
         out[e, 2, 2] = along * dz * dz + across
 
 
-def forces(mesh: LinkMesh, x: Array) -> Array:
-    """Forces (n, 3) mN of the links on all nodes, fixed ones included, at positions ``x`` (n, 3)."""
+@njit(cache=True, nogil=True, error_model="numpy")
+def keep_slip(x: Array, links: np.ndarray, rest_length: Array, law: LinkLaw, slip: Array) -> None:
+    """Moves ``slip`` (m,) mm to where the links keep it at ``x`` (n, 3)."""
+    for e in range(len(links)):
+        if law.loss[e] > 0.0:
+            i, j = links[e, 0], links[e, 1]
+            dx, dy, dz = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
+            elongation = math.sqrt(dx * dx + dy * dy + dz * dz) - rest_length[e]
+            slip[e] = slip_at(
+                elongation, slip[e], law.stiffness[e], law.growth[e], law.toe[e], law.loss[e], law.friction[e]
+            )
+
+
+def never_stretched(mesh: LinkMesh) -> Branch | None:
+    """The law of the mesh's links and their memory of nothing; None for constant stiffness."""
+    return None if mesh.law is None else Branch(mesh.law, np.zeros(len(mesh.links)))
+
+
+def settle(mesh: LinkMesh, x: Array, branch: Branch | None) -> None:
+    """The links remember that they came to rest at ``x`` (n, 3): from there some unload along another branch.
+
+    To be called after each equilibrium of a path whose links lose energy. No solve does it, nor does
+    ``path_following``: a movement may be tried and taken back.
+    """
+    if branch is not None:
+        keep_slip(x, mesh.links, mesh.rest_length, branch.law, branch.slip)
+
+
+def forces(mesh: LinkMesh, x: Array, branch: Branch | None = None) -> Array:
+    """Forces (n, 3) mN of the links on all nodes, fixed ones included, at positions ``x`` (n, 3).
+
+    Here and below the links of a mesh with a law were never stretched before, unless ``branch`` says so.
+    """
     out = np.zeros_like(mesh.rest)
-    add_forces(x, mesh.links, mesh.rest_length, mesh.stiffness, 0, len(mesh.links), out)
+    branch = branch or never_stretched(mesh)
+    add_forces(x, mesh.links, mesh.rest_length, mesh.stiffness, 0, len(mesh.links), out, branch)
     return out
 
 
-def energy(mesh: LinkMesh, x: Array) -> float:
+def energy(mesh: LinkMesh, x: Array, branch: Branch | None = None) -> float:
     """Elastic energy, mN mm, at positions ``x`` (n, 3)."""
     scratch = np.zeros_like(mesh.rest)
-    return float(add_forces(x, mesh.links, mesh.rest_length, mesh.stiffness, 0, len(mesh.links), scratch))
+    branch = branch or never_stretched(mesh)
+    return float(add_forces(x, mesh.links, mesh.rest_length, mesh.stiffness, 0, len(mesh.links), scratch, branch))
 
 
-def blocks(mesh: LinkMesh, x: Array, project: bool = False) -> Array:
+def blocks(mesh: LinkMesh, x: Array, project: bool = False, branch: Branch | None = None) -> Array:
     """The block B (m, 3, 3) mN/mm of each link at ``x`` (n, 3), plain or positive semidefinite."""
     out = np.zeros((len(mesh.links), 3, 3))
-    link_blocks(x, mesh.links, mesh.rest_length, mesh.stiffness, project, out)
+    branch = branch or never_stretched(mesh)
+    link_blocks(x, mesh.links, mesh.rest_length, mesh.stiffness, project, out, branch)
     return out
 
 
-def diagonal_blocks(mesh: LinkMesh, x: Array, project: bool = False) -> Array:
+def diagonal_blocks(mesh: LinkMesh, x: Array, project: bool = False, branch: Branch | None = None) -> Array:
     """The Hessian's diagonal blocks (n, 3, 3) mN/mm: how a node resists when only it moves."""
     out = np.zeros((len(mesh.rest), 3, 3))
-    link = blocks(mesh, x, project)
+    link = blocks(mesh, x, project, branch)
     np.add.at(out, mesh.links[:, 0], link)
     np.add.at(out, mesh.links[:, 1], link)
     return out
 
 
-def hessian(mesh: LinkMesh, x: Array, project: bool = False) -> Array:
+def hessian(mesh: LinkMesh, x: Array, project: bool = False, branch: Branch | None = None) -> Array:
     """The energy's second derivatives, dense (3 n, 3 n) mN/mm, fixed nodes included: for small meshes and tests."""
     n = len(mesh.rest)
     out = np.zeros((n, n, 3, 3))
-    out[np.arange(n), np.arange(n)] = diagonal_blocks(mesh, x, project)
-    link = blocks(mesh, x, project)
+    out[np.arange(n), np.arange(n)] = diagonal_blocks(mesh, x, project, branch)
+    link = blocks(mesh, x, project, branch)
     np.subtract.at(out, (mesh.links[:, 0], mesh.links[:, 1]), link)
     np.subtract.at(out, (mesh.links[:, 1], mesh.links[:, 0]), link)
     return out.transpose(0, 2, 1, 3).reshape(3 * n, 3 * n)

@@ -5,6 +5,7 @@ nodes have moved by d, the first step is the tangent to the path of equilibria, 
 along with them. Where H is not positive definite, the smallest of a few multiples of the identity that makes it so is
 added, and the step leads down. Each further step is shortened until the energy falls (Armijo; Nocedal and Wright,
 Numerical Optimization, algorithms 3.1 and 3.3), so that the energy never rises but by rounding.
+Links with a law (``link_tension``) have kinks, between which the method is Newton's and at which the search holds it.
 
 Each system is factored anew by scipy's SuperLU: the reference for the others. ``krylov`` is for big meshes.
 """
@@ -19,7 +20,7 @@ from scipy.sparse import csc_matrix, eye_array
 from scipy.sparse.linalg import SuperLU, splu
 
 from trainer.geometry import Array
-from trainer.mechanics.links import LinkMesh, add_forces, link_blocks
+from trainer.mechanics.links import LinkMesh, add_forces, link_blocks, never_stretched
 
 #: Sufficient decrease (Armijo), and the shortest step tried.
 DECREASE, SHORTEST_STEP = 1e-4, 1e-6
@@ -86,6 +87,7 @@ class Newton:
         refuse_loose_nodes(mesh)
         self.mesh = mesh
         self.x = mesh.rest.copy()
+        self.branch = never_stretched(mesh)  # where on their law the links are; ``links.settle`` moves it
         self._longest = float(np.median(mesh.rest_length))
         self._block = np.zeros((len(mesh.links), 3, 3))
         self._trial, self._step, self._way = (mesh.rest.copy() for _ in range(3))
@@ -130,7 +132,7 @@ class Newton:
         trial[:] = x
         if np.any(way):
             self._evaluate(x, free, load, self._force)
-            link_blocks(x, self.mesh.links, self.mesh.rest_length, self.mesh.stiffness, False, self._block)
+            self._stiffness()
             multiply(self._block, self.mesh.links, way, self._trial_force)
             self._trial_force[~free] = 0.0
             np.subtract(self._force, self._trial_force, out=self._trial_force)
@@ -148,11 +150,15 @@ class Newton:
 
     def _direction(self, free: np.ndarray) -> None:
         """Newton's step from ``x`` into ``_step``; it leads down."""
-        m = self.mesh
-        link_blocks(self.x, m.links, m.rest_length, m.stiffness, False, self._block)
+        self._stiffness()
         shift = 0.0
         while not (self._solve(self._force, free, shift) and float(np.vdot(self._force, self._step)) > 0.0):
-            shift = max(GROWTH * shift, FIRST_SHIFT * float(np.max(m.stiffness)))
+            shift = max(GROWTH * shift, FIRST_SHIFT * float(np.max(self.mesh.stiffness)))
+
+    def _stiffness(self) -> None:
+        """The second derivatives at ``x`` into ``_block``."""
+        m = self.mesh
+        link_blocks(self.x, m.links, m.rest_length, m.stiffness, False, self._block, self.branch)
 
     def _solve(self, force: Array, free: np.ndarray, shift: float) -> bool:
         """The step that ``_block`` and a ``shift``, mN/mm, on its diagonal answer to ``force`` with, into ``_step``;
@@ -186,7 +192,7 @@ class Newton:
         """The energy at ``x`` (n, 3); ``force`` (n, 3) becomes what is unbalanced on the free nodes."""
         m = self.mesh
         force[:] = load
-        energy = add_forces(x, m.links, m.rest_length, m.stiffness, 0, len(m.links), force)
+        energy = add_forces(x, m.links, m.rest_length, m.stiffness, 0, len(m.links), force, self.branch)
         force[~free] = 0.0
         return float(energy - np.vdot(load, x))
 

@@ -28,6 +28,7 @@ from numba import njit
 from scipy.spatial import cKDTree
 
 from trainer.geometry import Array
+from trainer.mechanics.link_tension import Branch
 from trainer.mechanics.links import LinkMesh, blocks, link_blocks
 from trainer.mechanics.multifrontal import Multifrontal
 from trainer.mechanics.nested_dissection import dissect
@@ -96,25 +97,28 @@ class Preconditioner:
             self._find_near()
             self._answer()
 
-    def renew(self, x: Array, block: Array) -> None:
+    def renew(self, x: Array, block: Array, branch: Branch | None = None) -> None:
         """A new factor of the whole, of the stiffness at ``x`` (n, 3), or above it; overwrites ``block`` (m, 3, 3)."""
         m = self.mesh
         for positive_part in (False, True):
-            link_blocks(x, m.links, m.rest_length, m.stiffness, positive_part, block)
+            link_blocks(x, m.links, m.rest_length, m.stiffness, positive_part, block, branch)
             if self._whole.compute(block):
                 break
         self._answer()
 
-    def update(self, x: Array, block: Array) -> None:
-        """``block`` (m, 3, 3) becomes the stiffness at ``x`` (n, 3), and the factor near the held nodes is of it."""
+    def update(self, x: Array, block: Array, branch: Branch | None = None) -> None:
+        """``block`` (m, 3, 3) becomes the stiffness at ``x`` (n, 3), and the factor near the held nodes is of it.
+
+        ``branch`` says where on their law the links are, if the mesh has one: here and above.
+        """
         m = self.mesh
-        link_blocks(x, m.links, m.rest_length, m.stiffness, False, block)
+        link_blocks(x, m.links, m.rest_length, m.stiffness, False, block, branch)
         if not self._near.compute(block):
-            link_blocks(x, m.links, m.rest_length, m.stiffness, True, block)
+            link_blocks(x, m.links, m.rest_length, m.stiffness, True, block, branch)
             if not self._near.compute(block):
                 self._near.factor.inverse[:] = 0.0  # B⁻¹ = 0: the factor of the whole alone
                 self._near.factor.panel[:] = np.float32(0.0)
-            link_blocks(x, m.links, m.rest_length, m.stiffness, False, block)
+            link_blocks(x, m.links, m.rest_length, m.stiffness, False, block, branch)
 
     def _find_near(self) -> None:
         """The nodes S, and their place in the factor B."""

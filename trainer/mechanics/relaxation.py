@@ -7,7 +7,8 @@ the moved ones, and may stop spreading where forces fall below a threshold.
 
 The paper chooses one α by trial. A fixed one that suits a mesh of 2000 nodes diverges at 300 and at 20 000; here
 α_i = 1 / Σ_j k_ij over the node's links, the reciprocal of the trace of its stiffness block and so at most half of
-the largest α at which the node's own iteration converges.
+the largest α at which the node's own iteration converges. Where k_ij is a function of the elongation, as the paper
+allows, its place is taken by the steepest that the link can become: then the same holds wherever the nodes go.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ import numpy as np
 from numba import njit
 
 from trainer.geometry import Array
-from trainer.mechanics.links import LinkMesh
+from trainer.mechanics.link_law import steepest_tangent
+from trainer.mechanics.link_tension import Branch, tension_of
+from trainer.mechanics.links import LinkMesh, never_stretched
 
 #: Sweeps between two looks at the residual and the time.
 SWEEPS_PER_LOOK = 10
@@ -65,14 +68,16 @@ def sweep(
     via: np.ndarray,
     rest_length: Array,
     stiffness: Array,
+    steepest: Array,
     load: Array,
     cut_off_mN: float,
     reached: np.ndarray,
+    branch: Branch | None,
 ) -> float:
     """One Gauss–Seidel sweep over ``order``; returns the Euclidean norm of the forces that it met, mN.
 
     ``reached`` (n,) bool says which nodes a force has come to; a node passes it on when the force on it is at least
-    ``cut_off_mN``, and is left alone before.
+    ``cut_off_mN``, and is left alone before. ``steepest`` (m,) mN/mm is the largest derivative of each link's tension.
     """
     total = 0.0
     for i in order:
@@ -84,9 +89,10 @@ def sweep(
             j, e = neighbour[entry], via[entry]
             dx, dy, dz = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
             length = math.sqrt(dx * dx + dy * dy + dz * dz)
-            trace += stiffness[e]
+            trace += steepest[e]
             if length > 0.0:
-                pull = stiffness[e] * (length - rest_length[e]) / length
+                tension, _ = tension_of(e, length - rest_length[e], stiffness, branch)
+                pull = tension / length
                 fx += pull * dx
                 fy += pull * dy
                 fz += pull * dz
@@ -113,15 +119,19 @@ def relax(
     most_links: int | None = None,
     cut_off_mN: float = 0.0,
     out_of_time: Callable[[], bool] = lambda: False,
+    branch: Branch | None = None,
 ) -> Relaxation:
     """Moves the variable nodes of ``x`` (n, 3), in place, towards equilibrium; the nodes ``moved`` (k,) stay.
 
     ``load`` (n, 3) mN is the external force on each node: gravity m_i g, a push. ``most_links`` and ``cut_off_mN``
     limit the region as in the paper. Ends when the residual is small enough, after ``most_sweeps``, or when
     ``out_of_time`` says so (the paper gives it 1/30 s); it is asked every few sweeps.
+    The links of a mesh with a law were never stretched before, unless ``branch`` says so.
     """
     order = breadth_first(mesh, moved, most_links)
     load = np.zeros_like(x) if load is None else load
+    branch = branch or never_stretched(mesh)
+    steepest = mesh.stiffness if branch is None else steepest_tangent(branch.law)
     reached = np.any(load != 0.0, axis=1)
     for i in moved:
         reached[mesh.neighbour[mesh.start[i] : mesh.start[i + 1]]] = True
@@ -140,9 +150,11 @@ def relax(
                     mesh.via,
                     mesh.rest_length,
                     mesh.stiffness,
+                    steepest,
                     load,
                     cut_off_mN,
                     reached,
+                    branch,
                 )
             )
             done += 1

@@ -23,7 +23,8 @@ import numpy as np
 from numba import njit
 
 from trainer.geometry import Array
-from trainer.mechanics.links import LinkMesh, add_forces
+from trainer.mechanics.link_tension import Branch, potential_of, tension_of
+from trainer.mechanics.links import LinkMesh, add_forces, never_stretched
 from trainer.mechanics.newton import Outcome, refuse_loose_nodes, refuse_not_finite
 from trainer.mechanics.relaxation import breadth_first
 
@@ -47,6 +48,7 @@ class BlockSweeps:
         refuse_loose_nodes(mesh)
         self.mesh = mesh
         self.x = mesh.rest.copy()
+        self.branch = never_stretched(mesh)  # where on their law the links are; ``links.settle`` moves it
         self.omega = 1.0
         self._known = False  # omega is found: the observed ratio says no more
         self._force = np.zeros_like(mesh.rest)
@@ -80,8 +82,9 @@ class BlockSweeps:
             first = last = 0.0
             for k in range(count):
                 last = sweep(
-                    x, order, mesh.start, mesh.neighbour, mesh.via, mesh.rest_length, mesh.stiffness, load, self.omega
-                )
+                    x, order, mesh.start, mesh.neighbour, mesh.via, mesh.rest_length, mesh.stiffness, load, self.omega,
+                    self.branch,
+                )  # fmt: skip
                 if k == count // 2:
                     first = last
             done += count
@@ -118,7 +121,7 @@ class BlockSweeps:
         """The energy, and the norm of the forces on the nodes of ``order``."""
         m = self.mesh
         self._force[:] = load
-        energy = add_forces(self.x, m.links, m.rest_length, m.stiffness, 0, len(m.links), self._force)
+        energy = add_forces(self.x, m.links, m.rest_length, m.stiffness, 0, len(m.links), self._force, self.branch)
         return float(energy - np.vdot(load, self.x)), float(np.linalg.norm(self._force[order]))
 
 
@@ -147,6 +150,7 @@ def sweep(
     stiffness: Array,
     load: Array,
     omega: float,
+    branch: Branch | None = None,
 ) -> float:
     """One sweep over the nodes ``order``; returns the Euclidean norm of the changes, mm."""
     total = 0.0
@@ -157,11 +161,12 @@ def sweep(
             j, e = neighbour[entry], via[entry]
             dx, dy, dz = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
             length = math.sqrt(dx * dx + dy * dy + dz * dz)
-            k, stretch = stiffness[e], length - rest_length[e]
+            stretch = length - rest_length[e]
+            tension, k = tension_of(e, stretch, stiffness, branch)
             trace += k
-            energy += 0.5 * k * stretch * stretch
+            energy += potential_of(e, stretch, stiffness, branch)
             if length > 0.0:
-                pull = k * stretch / length
+                pull = tension / length
                 across = max(pull, 0.0)
                 along = (k - across) / (length * length)
                 fx += pull * dx
@@ -193,7 +198,7 @@ def sweep(
                 j, e = neighbour[entry], via[entry]
                 dx, dy, dz = x[j, 0] - x[i, 0] - sx, x[j, 1] - x[i, 1] - sy, x[j, 2] - x[i, 2] - sz
                 stretch = math.sqrt(dx * dx + dy * dy + dz * dz) - rest_length[e]
-                changed += 0.5 * stiffness[e] * stretch * stretch
+                changed += potential_of(e, stretch, stiffness, branch)
             if changed <= energy * (1.0 + ROUNDING):
                 x[i, 0] += sx
                 x[i, 1] += sy
