@@ -20,6 +20,7 @@ from trainer.geometry import Array, Rigid, quaternion_from_axis_angle
 from trainer.mechanics import banded
 from trainer.mechanics.attachments import Anchors, Cable, Frictions
 from trainer.mechanics.equilibrium import Equilibrium
+from trainer.mechanics.link_law import j_shaped
 from trainer.mechanics.links import blocks, forces, hessian, link_mesh
 from trainer.mechanics.minimise import CABLE_MM, MOST_STEPS, STEP_MM
 from trainer.mechanics.relaxation import breadth_first, relax
@@ -138,6 +139,12 @@ def test_a_body_that_can_move_freely_is_refused(tissue: Tissue) -> None:
     mesh = tissue.mesh
     with pytest.raises(ValueError, match="do not hold all free nodes"):
         banded.factor(blocks(mesh, mesh.rest), mesh.links, np.arange(tissue.offset[1], dtype=np.int32), len(mesh.rest))
+
+
+def test_links_with_a_law_of_their_own_are_refused(tissue: Tissue) -> None:
+    bent = replace(tissue.mesh, law=j_shaped(tissue.mesh, 20.0, 0.1))
+    with pytest.raises(ValueError, match="constant stiffness"):
+        Equilibrium(bent, tissue.orders())
 
 
 def test_nothing_held_nothing_moves(tissue: Tissue) -> None:

@@ -63,7 +63,10 @@ class Equilibrium:
 
     def __init__(self, mesh: LinkMesh, orders: tuple[np.ndarray, ...]) -> None:
         """``orders``: the free nodes of each body in elimination order; bodies share no link and follow one another
-        in the numbering of nodes and links. Raises ValueError when the links leave a node free to move."""
+        in the numbering of nodes and links. Raises ValueError when the links leave a node free to move, or
+        have a law of their own."""
+        if mesh.law is not None:
+            raise ValueError("the kept factor knows links of constant stiffness only: take newton, krylov or sweeps")
         n = len(mesh.rest)
         self.mesh = mesh
         self.x = mesh.rest.copy()
