@@ -22,7 +22,7 @@ from trainer.mechanics.links import LinkMesh, link_blocks
 from trainer.mechanics.quasi_newton import at_points
 
 #: A new factor is taken so many solves after it was begun.
-LAG = 8
+LAG = 12
 #: Solves for which a new factor is used before another one of the same body may be begun.
 LASTS = 10
 #: At rest no pivot is below 0.4 of the diagonal. A state in which one is below this is nearly or truly unstable.
