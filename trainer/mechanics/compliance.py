@@ -29,7 +29,7 @@ LASTS = 10
 LEAST_PIVOT = 0.05
 #: A link that is cut keeps this share of its stiffness in new factors, and there alone: a piece that hangs on nothing
 #: else stays within a matrix that can be factored, and goes along with what it was cut from until it is pulled.
-TIE = 0.05
+TIE = 0.2
 #: In place of a slot's body: the slot holds nothing.
 FREE = -1
 
