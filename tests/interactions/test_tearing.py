@@ -10,12 +10,13 @@ from test_scene import LEFT, RIGHT, STITCH, at, close, go, poses
 
 from trainer import scene
 from trainer.anatomy.slit import slit_links
+from trainer.anatomy.vessel import wall_point
 from trainer.curriculum import Task
 from trainer.drivers.scripted import ScriptedHands
 from trainer.events import Event, Tear
-from trainer.geometry import Array, Rigid
+from trainer.geometry import Rigid
 from trainer.interactions import pierce, tearing
-from trainer.interactions.world import World
+from trainer.interactions.world import Hole, World
 from trainer.mechanics.links import forces
 from trainer.poses import ToolPoses
 from trainer.profile import Hand
@@ -190,6 +191,39 @@ def test_a_wall_that_tears_in_jaws_is_slit_through_from_where_they_held_it() -> 
     close(s, LEFT, 0.0)
     go(s, LEFT, place, 0.0, 0.5)
     assert "grasp" in [e.kind for e in close(s, LEFT, 0.9)]
+
+
+@pytest.mark.parametrize(("hour", "same_pass", "open_through"), [(0.7, 1, True), (0.7, 2, False), (3.5, 1, False)])
+def test_the_two_holes_of_a_bite_make_one_slit(hour: float, same_pass: int, open_through: bool) -> None:
+    """Outer wall at 0.2 rad, inner wall further on: nothing is left across once both tore, unless they are of two
+    passes, or of the vessel's two sides. Those are slits of their own, and the wall is whole between them."""
+    s = scene.build(STITCH)
+    world = s.world
+    assert world.tissue is not None
+    assert world.solver is not None
+    for number, (wall, clock, pass_number) in enumerate((("outer", 0.2, 1), ("inner", hour, same_pass))):
+        nodes, weights = wall_point(world.tissue.vessels[0], clock, 0.4, "inner" if number else "outer")
+        place = pierce.place_on(world, 0, wall, nodes, weights)
+        slot = world.solver.hold(nodes, weights)
+        edge = nodes, weights
+        around = np.zeros(0, dtype=np.int64)
+        hole = Hole(number, place, slot, True, pass_number, np.zeros(3), 0.0, around, edge, open=False, torn=True)
+        world.holes.append(hole)
+        tearing.rip_out(world, hole)
+
+    def left(walls: tuple[str, ...], clocks: tuple[float, float]) -> bool:
+        """Whether a link of these walls bears across a slit at these hours of the two."""
+        assert world.tissue is not None
+        assert world.solver is not None
+        crossed = slit_links(world.tissue.vessels[0], walls, clocks, 0.35)
+        return bool((world.solver.mesh.stiffness[crossed] > 0.0).any())
+
+    if open_through:
+        assert not left(("outer", "inner"), (0.2, hour))
+    else:
+        assert not left(("outer",), (0.2, 0.2))
+        assert not left(("inner",), (hour, hour))
+        assert left(("outer", "inner"), (0.2, 0.2))
 
 
 def test_a_tip_on_what_a_slit_opens_touches_nothing_any_more() -> None:

@@ -185,7 +185,7 @@ def test_a_piece_that_came_off_goes_where_it_is_held_and_else_stays() -> None:
     node = VESSEL.node(5, 3)
     other = grip(state, [node])
     for k in range(3 * LAG):
-        tick(state, other, (MESH.rest[node] + [0.0, 0.0, 0.01 * k])[None])
+        tick(state, other, (MESH.rest[node] + np.array([0.0, 0.0, 0.01 * k]))[None])
         assert np.array_equal(state.x[off], left)
     assert np.abs(state.x - MESH.rest)[on].max() > 0.1
     again = grip(state, held)
@@ -204,11 +204,11 @@ def test_a_node_that_lost_all_its_links_stays_where_it_is_until_it_is_held() -> 
     state.cut(MESH.via[MESH.start[lonely] : MESH.start[lonely + 1]])
     at = state.x[lonely].copy()
     for k in range(3 * (LAG + LASTS)):
-        tick(state, slots, (place + [0.0, 0.0, 0.05 * np.sin(0.3 * k)])[None])
+        tick(state, slots, (place + np.array([0.0, 0.0, 0.05 * np.sin(0.3 * k)]))[None])
         assert np.isfinite(state.x).all()
         assert np.array_equal(state.x[lonely], at)
     both = np.concatenate([slots, grip(state, [lonely])])
-    target = np.stack([place, at + [0.1, 0.0, 0.3]])
+    target = np.stack([place, at + np.array([0.1, 0.0, 0.3])])
     for _ in range(3):
         assert state.solve(anchors(both, target), tolerance_mN=1e-6, max_iterations=100).converged
     assert np.abs(state.x[lonely] - target[1]).max() <= 1e-6 / JAWS * 2.0
