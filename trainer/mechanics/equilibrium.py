@@ -135,6 +135,7 @@ class Equilibrium:
             raise ValueError(f"links are counted from 0 to {len(self.mesh.links) - 1}, found {links.tolist()}")
         self.mesh.stiffness[links] = 0.0
         self._memory.known[self.compliance.cut(links)] = 0
+        self._memory.at[:] = np.nan  # forces that were found there are no longer those
         self._pieces, self._still = loose_pieces(self.mesh), set()
         self._tied[:] = True
         for nodes in self._pieces:
