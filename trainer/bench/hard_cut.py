@@ -1,7 +1,7 @@
 """A vessel is slit while jaws draw at it, as in a session, tick by tick in real time.
 
 Jaws hold a triangle beside the slit and go to and fro, before the cut and after it; the links are cut before a tick's
-solve, and nothing else changes. The solves are a scene's: eight iterations at most, to a hundredth of a millinewton.
+solve, and nothing else changes. The solves are a scene's, with as few iterations.
 The law: no position that is not finite, and no node that flies; once the jaws rest, the energy of what is left and of
 their springs does not rise, and the forces are in equilibrium again, as a mesh measures them that never had the links.
 Told are the ticks up to three factors after the cut, cut and solve together, and those before it: the median of all;
@@ -22,6 +22,7 @@ from trainer.anatomy.slit import slit_links
 from trainer.anatomy.vessel import Vessel, build
 from trainer.config import Sourced
 from trainer.curriculum import VesselSpec
+from trainer.interactions.holding import HOLD, MOST_ITERATIONS, TOLERANCE_MN
 from trainer.mechanics.attachments import Anchors
 from trainer.mechanics.compliance import LAG
 from trainer.mechanics.equilibrium import Equilibrium, Result
@@ -29,8 +30,8 @@ from trainer.mechanics.links import LinkMesh, energy, forces, link_mesh
 
 #: A tick of the tasks, s.
 TICK_S = 0.01
-#: As in a scene: interactions.holding, with its jaws on this wall, mN/mm.
-TOLERANCE_mN, MOST_ITERATIONS, JAWS = 0.01, 8, 7.5e3
+#: What jaws hold this wall with in a scene, mN/mm: interactions.holding.
+JAWS = HOLD * 500.0 * 0.15
 #: Ticks before the cut, and after it.
 BEFORE, AFTER = 3 * LAG, 3 * LAG
 #: How often each case is run.
@@ -87,7 +88,7 @@ class _Drawn:
         vessel = _vessel()
         self.places = vessel.mesh.rest[self.nodes] + out_mm * vessel.twelve + aside_mm * vessel.three
         held = Anchors(self.slots, self.places, self.stiffness)
-        return self.state.solve(held, tolerance_mN=TOLERANCE_mN, max_iterations=MOST_ITERATIONS)
+        return self.state.solve(held, tolerance_mN=TOLERANCE_MN, max_iterations=MOST_ITERATIONS)
 
     def energy_and_rest(self, left: LinkMesh) -> tuple[float, float]:
         """Energy, mN mm, of the mesh ``left`` and the jaws' springs, and the forces that are not balanced, mN."""
@@ -123,7 +124,7 @@ def _round(links: np.ndarray, tick_s: float) -> tuple[list[float], int]:
         assert now <= before * (1.0 + ROUNDING), f"the energy rose from {before:g} to {now:g} mN mm"
         before = now
         if ended.converged:
-            assert rest <= TOLERANCE_mN * (1.0 + ROUNDING), f"residual {rest:.1e} mN, and it says that it converged"
+            assert rest <= TOLERANCE_MN * (1.0 + ROUNDING), f"residual {rest:.1e} mN, and it says that it converged"
             return ms, again
     raise AssertionError(f"{AFTER} ticks after the jaws came to rest there are {rest:.1e} mN left")
 
