@@ -1,13 +1,14 @@
 """A vessel is slit while jaws draw at it, as in a session, tick by tick in real time.
 
 Jaws hold a triangle beside the slit and go to and fro, before the cut and after it; the links are cut before a tick's
-solve, and nothing else changes. The solves are a scene's, with as few iterations.
-The law: no position that is not finite, and no node that flies; once the jaws rest, the energy of what is left and of
-their springs does not rise, and the forces are in equilibrium again, as a mesh measures them that never had the links.
-Told are the ticks up to three factors after the cut, cut and solve together, and those before it: the median of all;
-that tick in which they took longest, by the median of the rounds; and the longest of all, in which another program may
-have had the core: beside it the most that a tick's own thread worked. And the tick after the cut in which the tissue was in equilibrium again. A stall would be a tick that
-is longer than the ten milliseconds which the clock gives it; nothing here fails by the clock.
+solve, and nothing else changes. The solves are a scene's, with as few iterations. The law: no position that is not
+finite, and no node that flies; once the jaws rest, the energy of what is left and of their springs does not rise, and
+the forces are in equilibrium again, as a mesh measures them that never had the links. Told are the ticks up to three
+factors after the cut, cut and solve together, and those before it: the median of all; that tick in which they took
+longest, by the median of the rounds; and the longest of all, in which another program may have had the core: beside it
+the most that a tick's own thread worked. And the tick after the cut in which the tissue was in equilibrium again. A
+stall would be a tick that is longer than the ten milliseconds which the clock gives it; nothing here fails by the
+clock.
 """
 
 from __future__ import annotations
@@ -100,7 +101,8 @@ class _Drawn:
 
 
 def _round(links: np.ndarray, tick_s: float) -> tuple[list[tuple[float, float]], int]:
-    """Milliseconds of each tick, and those that its thread had a core; and the tick after the cut in which the tissue was in equilibrium again, or 0."""
+    """Milliseconds of each tick, and those that its thread had a core; and the tick after the cut in which the tissue
+    was in equilibrium again, or 0."""
     drawn, mesh = _Drawn(), _vessel().mesh
     ms: list[tuple[float, float]] = []
     again = 0
