@@ -78,6 +78,7 @@ def build(task: Task, tolerance_mN: float = holding.TOLERANCE_MN, anatomy: Anato
             for wall, triangles in (("outer", vessel.outer_triangles), ("inner", vessel.inner_triangles))
         ]
         world.surface = np.concatenate([triangles for _, _, triangles in walls])
+        world.slit = np.zeros(len(world.surface), dtype=np.bool_)
         ends = itertools.accumulate(len(triangles) for _, _, triangles in walls)
         world.part = {(v, wall): (end - len(t), end) for (v, wall, t), end in zip(walls, ends, strict=True)}
     if spec.needle is not None:

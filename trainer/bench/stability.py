@@ -22,6 +22,7 @@ Case = tuple[str, str, Callable[[], str]]
 SUBJECTS = {
     "hard_integrators": "Integration in time",
     "hard_vessel": "Static equilibrium",
+    "hard_cut": "Cuts",
     "hard_thread": "The thread",
     "hard_contact": "Contact search",
     "hard_volume": "Volumes of tissue",

@@ -9,7 +9,7 @@ import numpy as np
 
 from trainer.events import Overforce, Tear
 from trainer.geometry import Array, length
-from trainer.interactions import grasp, pierce, thread_pull
+from trainer.interactions import grasp, pierce, tearing, thread_pull
 from trainer.interactions.world import Hole, World
 from trainer.mechanics.attachments import Anchors, Cable
 from trainer.mechanics.equilibrium import Result
@@ -147,11 +147,13 @@ def _tear_worst(world: World, holes: list[tuple[Hole, float]], time_s: float) ->
     if not over:
         return
     _, hole, load, limit = max(over, key=lambda o: (o[0], -o[1].number))
+    place = hole.place
     pierce.close(world, hole)
     hole.torn = True
+    tearing.rip_out(world, hole)
     world.emit(
-        Tear, time_s, "", body=world.vessel_name(hole.place), wall=hole.place.wall, hole=hole.number,
-        point=world.place_in_world(world.point(hole.place)), force_mN=load, limit_mN=limit,
+        Tear, time_s, "", body=world.vessel_name(place), wall=place.wall, hole=hole.number,
+        point=world.place_in_world(world.point(place)), force_mN=load, limit_mN=limit,
     )  # fmt: skip
 
 
@@ -167,12 +169,13 @@ def _judge_jaw(world: World, tool: int, load: float, time_s: float) -> None:
     jaw = world.jaws[tool]
     if jaw.target != "wall":
         return
-    assert world.tissue is not None
+    assert world.tissue is not None and world.solver is not None
     vessel = world.tissue.vessels[jaw.vessel].spec
     limit = grasp.capacity_mN(world, tool)
     if load > vessel.tear_mN.value:
-        wall = jaw.wall
+        wall, torn, nodes = jaw.wall, jaw.vessel, world.solver.compliance.slot_nodes[jaw.slots[0]]
         grasp.let_go(world, jaw)
+        tearing.rip_from_jaws(world, torn, nodes)
         world.emit(
             Tear, time_s, world.tools[tool], body=vessel.name, wall=wall, hole=-1,
             point=world.place_in_world(jaw.pose.position), force_mN=load, limit_mN=vessel.tear_mN.value,

@@ -188,8 +188,8 @@ def place_on(world: World, vessel: int, wall: str, nodes: np.ndarray, weights: A
 
 def passed(world: World, arc: float) -> np.ndarray:
     """Triangles (f,) bool of the walls that touch a hole which is less than ``arc`` mm behind the tip, or ahead of
-    it."""
-    skip = np.zeros(len(world.surface), dtype=np.bool_)
+    it; and those that a tear has opened."""
+    skip = world.slit.copy()
     for hole in world.open_holes():
         if hole.arc < arc:
             skip[hole.around] = True

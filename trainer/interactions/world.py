@@ -127,6 +127,7 @@ class World:
     tissue: Tissue | None = None
     solver: Equilibrium | None = None
     surface: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), np.int32))  # (f, 3) triangles of all walls
+    slit: np.ndarray = field(default_factory=lambda: np.zeros(0, np.bool_))  # (f,) which of them a tear has opened
     part: dict[tuple[int, str], tuple[int, int]] = field(default_factory=dict)  # (vessel, wall) → its rows of these
     needle: Needle | None = None
     needle_pose: Rigid = field(default_factory=Rigid.identity)
@@ -161,9 +162,10 @@ class World:
         return vector(self.world_from_scene.rotate(direction))
 
     def wall(self, vessel: int, wall: str) -> np.ndarray:
-        """The triangles (f, 3) of one wall."""
+        """The triangles (f, 3) of one wall, without those that a tear has opened."""
         first, last = self.part[vessel, wall]
-        return self.surface[first:last]
+        triangles, slit = self.surface[first:last], self.slit[first:last]
+        return triangles[~slit] if slit.any() else triangles
 
     def wall_of(self, triangle: int) -> tuple[int, str]:
         """The vessel and the wall that a triangle of ``surface`` belongs to."""

@@ -4,13 +4,14 @@ Solves equation (2) of Brown et al. 2001 for all nodes at once, where the paper 
 stiffness of the rest state is factored once for each body (a band per vessel). Every solve minimises the energy by
 L-BFGS from the present state with that factor as base; what holds the tissue (anchors, cables) is few scalar rows and
 is included exactly. Nothing is factored again when a hold comes, goes or moves; a body that is bent so far that its
-rest stiffness misleads is factored anew where it is, a slice at each solve. A body that nothing holds costs nothing.
+rest stiffness misleads is factored anew where it is, beside the solves; so is one that was cut. A body that nothing
+holds costs nothing.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +21,7 @@ from trainer.mechanics import banded
 from trainer.mechanics.attachments import Anchors, Cable, Frictions, Rows, fill, lay_out
 from trainer.mechanics.compliance import FREE, Compliance
 from trainer.mechanics.links import LinkMesh
+from trainer.mechanics.loose_pieces import loose_pieces, unstrained
 from trainer.mechanics.minimise import Base, Bodies, Held, Memory, approach
 from trainer.mechanics.quasi_newton import at_points
 
@@ -56,6 +58,8 @@ class _Group(NamedTuple):
     frictions: list[int]
     rows: Rows
     held: Held
+    pieces: set[int]  # loose ones that something holds
+    mesh: Bodies
 
 
 class Equilibrium:
@@ -68,17 +72,18 @@ class Equilibrium:
         if mesh.law is not None:
             raise ValueError("the kept factor knows links of constant stiffness only: take newton, krylov or sweeps")
         n = len(mesh.rest)
-        self.mesh = mesh
+        self.mesh = replace(mesh, stiffness=mesh.stiffness.copy())  # its own: a link that is cut has none
         self.x = mesh.rest.copy()
         self.compliance = Compliance(mesh, orders)
         held, bodies = self.compliance, len(orders)
         self._bodies = Bodies(
             links=mesh.links,
             rest_length=mesh.rest_length,
-            stiffness=mesh.stiffness,
+            stiffness=self.mesh.stiffness,
             fixed=mesh.fixed,
             span=np.array(held.links, dtype=np.int64),
             nodes=np.array(held.nodes, dtype=np.int64),
+            adrift=np.zeros(0, dtype=np.int64),
             longest_step=float(np.median(mesh.rest_length)),
         )
         self._memory = Memory(
@@ -98,6 +103,9 @@ class Equilibrium:
             v=banded.scratch(held.factors),
         )
         self._at_rest = [True] * bodies
+        self._pieces: list[np.ndarray] = []  # nodes of each that came off what is fixed
+        self._tied = np.full(n, True)  # nodes of none of them
+        self._still: set[int] = set()  # pieces that nothing holds, in their own shape
         self._last_target: dict[int, list[float]] = {}
         self._tension: dict[tuple[int, ...], float] = {}
         self._groups: dict[_Slots, list[_Group]] = {}  # of what was held since a slot last came or went
@@ -114,6 +122,25 @@ class Equilibrium:
         self.compliance.drop(slot)
         self._last_target.pop(slot, None)
         self._tension = {k: v for k, v in self._tension.items() if slot not in k}
+
+    def cut(self, links: np.ndarray) -> None:
+        """The ``links`` (k,) of the mesh bear nothing from now on.
+
+        The next solves go on with the factor that is there, while one without the links is made. A piece that hangs on
+        nothing fixed any more goes where it is held; what nothing holds stays where it is. Raises ValueError for a
+        number that is no link's.
+        """
+        links = np.asarray(links, dtype=np.int64)
+        if np.any((links < 0) | (links >= len(self.mesh.links))):
+            raise ValueError(f"links are counted from 0 to {len(self.mesh.links) - 1}, found {links.tolist()}")
+        self.mesh.stiffness[links] = 0.0
+        self._memory.known[self.compliance.cut(links)] = 0
+        self._memory.at[:] = np.nan  # forces that were found there are no longer those
+        self._pieces, self._still = loose_pieces(self.mesh), set()
+        self._tied[:] = True
+        for nodes in self._pieces:
+            self._tied[nodes] = False
+        self._groups.clear()
 
     def position(self, slot: int) -> Array:
         """Where a material point is, (3,) mm."""
@@ -146,6 +173,10 @@ class Equilibrium:
             self._groups[slots] = self._grouped(anchors, cables, frictions)
         groups = self._groups[slots]
         self._rest(groups)
+        if self.compliance.outdated:
+            self.compliance.refresh(sorted(self.compliance.outdated), self.x)
+        if not groups:
+            self.compliance.start()
         targets: dict[int, list[float]] = {}
         tension: dict[tuple[int, ...], float] = {}
         parts = [
@@ -189,7 +220,7 @@ class Equilibrium:
         anchor_force, tension = np.zeros_like(way), np.zeros(len(cables))
         self.compliance.start()
         converged, iterations, steps, residual, reached = approach(
-            self.x, self._bodies, self._base(), rows, held, self._memory, way, np.zeros(len(cables)), tolerance_mN,
+            self.x, group.mesh, self._base(), rows, held, self._memory, way, np.zeros(len(cables)), tolerance_mN,
             max_iterations, anchor_force, tension,
         )  # fmt: skip
         if iterations > steps * SLOW or not converged:
@@ -224,8 +255,17 @@ class Equilibrium:
             c = [n for n, through in enumerate(on_cables) if through[0] in group]
             f = [n for n, b in enumerate(rubbed) if b in group]
             rows = lay_out(anchors.slot[a], [cables[n].slot for n in c], frictions.slot[f])
-            found.append(_Group(sorted(group), a, c, f, rows, self._held(sorted(group), rows)))
+            mesh, pieces = self._bodies, self._held_pieces(rows)
+            if adrift := [nodes for p, nodes in enumerate(self._pieces) if p not in pieces]:
+                mesh = mesh._replace(adrift=np.concatenate(adrift))
+            found.append(_Group(sorted(group), a, c, f, rows, self._held(sorted(group), rows), pieces, mesh))
         return found
+
+    def _held_pieces(self, rows: Rows) -> set[int]:
+        """The loose pieces on which a material point in use is."""
+        bears = self.compliance.slot_weights[rows.slots] != 0.0
+        at = self.compliance.slot_nodes[rows.slots][bears]
+        return {p for p, nodes in enumerate(self._pieces) if np.isin(nodes, at).any()}
 
     def _bodies_of(self, slots: np.ndarray) -> list[int]:
         found = [self.compliance.slot_body[slot] for slot in slots.tolist()]
@@ -234,13 +274,21 @@ class Equilibrium:
         return found
 
     def _rest(self, groups: list[_Group]) -> None:
-        """Puts to rest the bodies that nothing holds: the only state without force that they have."""
+        """Puts to rest the bodies that nothing holds: the only state without force that they have. Of a loose piece
+        that is the nearest such state."""
         awake = {b for group in groups for b in group.bodies}
         for b, (lo, hi) in enumerate(self.compliance.nodes):
             if b not in awake and not self._at_rest[b]:
-                self.x[lo:hi] = self.mesh.rest[lo:hi]
+                tied = lo + np.flatnonzero(self._tied[lo:hi])
+                self.x[tied] = self.mesh.rest[tied]
                 self._memory.known[b] = 0
             self._at_rest[b] = b not in awake
+        held = {p for group in groups for p in group.pieces}
+        for p, nodes in enumerate(self._pieces):
+            if p not in held and p not in self._still:
+                self.x[nodes] = unstrained(self.mesh.rest[nodes], self.x[nodes])
+                self._memory.known[self.compliance.body_of(int(nodes[0]))] = 0
+        self._still = set(range(len(self._pieces))) - held
 
     def _base(self) -> Base:
         c = self.compliance

@@ -53,6 +53,7 @@ class Bodies(NamedTuple):
     fixed: np.ndarray  # (n,) bool
     span: np.ndarray  # (bodies, 2) int64, rows of a body's links
     nodes: np.ndarray  # (bodies, 2) int64, rows of a body's free nodes
+    adrift: np.ndarray  # (k,) int64, nodes that nothing holds any more: they stay
     longest_step: float  # mm, of a node along a coordinate in one iteration
 
 
@@ -179,6 +180,8 @@ def direction(bodies: Bodies, base: Base, rows: Rows, held: Held, memory: Memory
         z, memory.s, memory.y, memory.newest, memory.known, held.nodes, held.weights, held.awake, bodies.nodes,
         held.pulled, held.curvature, held.share, held.at,
     )  # fmt: skip
+    for i in bodies.adrift:
+        z[i, 0] = z[i, 1] = z[i, 2] = 0.0
     slope = 0.0
     for b in held.awake:
         slope += dot(memory.g, z, bodies.nodes[b, 0], bodies.nodes[b, 1])
