@@ -120,8 +120,8 @@ def overfull(task: Task, choice: Choice | None) -> str:
         return ""
     return (
         f"the vessels have {nodes} nodes: a tick is expected to take {expected_ms:.0f} ms or more, the task gives it "
-        f"{tick_ms:g} ms ({choice.timed_ms:.3g} ms were measured at {choice.timed_nodes} nodes); getting ready may take "
-        "minutes, and less 'layers' or 'around' are faster"
+        f"{tick_ms:g} ms ({choice.timed_ms:.3g} ms were measured at {choice.timed_nodes} nodes); getting ready may "
+        "take minutes, and less 'layers' or 'around' are faster"
     )
 
 
