@@ -23,6 +23,7 @@ SUBJECTS = {
     "hard_integrators": "Integration in time",
     "hard_vessel": "Static equilibrium",
     "hard_thread": "The thread",
+    "hard_draped": "The thread on vessels",
     "hard_contact": "Contact search",
     "hard_volume": "Volumes of tissue",
     "hard_scan": "Scans",
@@ -40,6 +41,10 @@ LONG = frozenset(
         ("patch pushed in by 1.2 R in one jump", "Newton, SuperLU"),
         ("collapsed vessel pulled open again", "relaxation"),
         ("collapsed vessel pulled open again", "Newton, SuperLU"),
+        ("held end leaps 20 mm in one tick", "XPBD, substeps of 10 µs"),
+        ("1000 links fall on the vessel in a heap, soft", "rod"),
+        ("1000 links fall on the vessel in a heap, limp", "rod"),
+        ("1000 links wound and heaped on two vessels", "follow-the-leader, draped"),
     }
 )
 
