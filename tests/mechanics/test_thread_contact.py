@@ -219,8 +219,7 @@ def test_a_link_round_an_edge_stays_outside_of_both_sides(turn: float) -> None:
 
 
 def test_a_thread_that_falls_across_a_ridge_hangs_over_it() -> None:
-    """No node's skin is deeper in a side than a hundredth of its radius: planes of contact are those of the tick's start,
-    and a node goes 0.3 mm/s x 1 ms along them at most. Half of a link's length may be behind either side's plane."""
+    """No node's skin is deeper in a side than a hundredth of its radius, since contacts are found once a tick."""
     surface, triangles = roof(0.6)
     count = 41
     x = np.stack([np.linspace(-1.0, 1.0, count), 0.01 * np.arange(count), np.full(count, 0.05)], axis=1)

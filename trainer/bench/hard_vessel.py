@@ -5,9 +5,10 @@ here again), has no more energy than where the instrument put it, and is on the 
 the way there matters. Every jump is followed in sub-steps, as ``mechanics.path_following`` chooses them, to 1e-4 mN.
 
 *Kept factor* so has up to 300 iterations a sub-step and holds of 1e6 mN/mm: it is what the method can do. *As in the
-scene* is what a session does of it: the jump is one tick, divided into movements as ``scene`` does it, each with 8
-iterations to 0.01 mN and the holds of a jaw, 7500 mN/mm; then the instrument rests for a second. It answers when a tick
-says that it converged, and how long that took is told; until then the scene judges nothing by its forces.
+scene* is what a session does of it: the jump is one tick, divided into movements as ``scene`` does it, each with the
+few iterations, the tolerance and a jaw's holds of ``interactions.holding`` (0.01 mN, 7500 mN/mm); then the instrument
+rests for a second. It answers when a tick says that it converged, and how long that took is told; until then the scene
+judges nothing by its forces.
 
 Thresholds: the residual may be ten times the tolerance, since methods measure it while they sweep, or at other nodes'
 places; on the right branch the answer is nearer than 0.01 R, other branches being 0.2 R and more away; held nodes are
