@@ -3,8 +3,9 @@
 The laws, at every tick: what is finite stays so, and no link is off its length by more than 1e-6 (beyond what the rod's
 own tension makes of it). The *rod* falls on a fixed tube of triangles, and nothing holds it, so that it gains no energy
 but 5e-3 of what lifts it by its length (``bench.thread_laws``); friction only takes. Its skin goes no deeper into a
-triangle than a tenth of its radius: contact is a force that answers to depth, of which its Newton leaves so much
-(assumed), and a link that is through a wall is off by its whole thickness.
+triangle than a tenth of its radius, 1.2 µm, and no node is in the tube: planes of contact are those of the tick's
+start, which a round tube is behind; where it bulges (0.12 / mm along its axis) a node that goes 0.04 mm along one, as
+at 150 mm/s, is 0.1 µm deep. Places *near* are those looked at, within a margin; a part of them touch.
 
 *Follow-the-leader, draped* is the paper's thread as a scene with ``drapes`` runs it: an instrument leads its end round
 both vessels, to and fro, until much of it lies on them and on itself. No point of it is deeper in a wall than half of
@@ -163,6 +164,10 @@ def heaped() -> str:
         on_walls = max(on_walls, int(np.count_nonzero(np.max(deep, axis=0) > -RADIUS_MM - LIES_MM)))
         on_itself = max(on_itself, len(own.near(x, 2.0 * RADIUS_MM + LIES_MM)))
         assert link_deep <= 0.5 * WALL_MM, f"tick {s.tick}: the thread is {link_deep:.2g} mm deep in a wall"
+    assert s.world.solver is not None
+    assert np.array_equal(s.world.solver.x, s.world.solver.mesh.rest), (
+        "a thread that presses on nothing moved the walls"
+    )
     words = (
         f"{on_walls} links on the walls, {on_itself} pairs on one another; lengths to {stretch:.0e}; a node goes up to "
         f"{beyond:.2f} mm in a tick beyond its leader's {STRIDE_MM:g}"
