@@ -206,7 +206,7 @@ class Watch:
             return
         w = np.zeros(3) if len(ways) == 0 else ways[0] / tick_s
         self.rested = 0 if np.any(ways) else self.rested + 1
-        if np.ptp(ways, axis=0).any() if len(ways) else False:
+        if len(ways) > 1 and np.ptp(ways, axis=0).any():
             return  # the holds do work on one another
         if not thread.uniform and self.rested < CUBIC:
             return
