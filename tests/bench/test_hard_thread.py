@@ -99,19 +99,21 @@ def test_energy_is_kept_in_the_frame_of_a_hold_that_goes_uniformly() -> None:
     differ by no more than 1e-6 of it, and energies by ten times that of weight times length.
     """
     model = bare(50)
-    w = np.array([300.0, 0.0, 0.0])
+    w = np.array([300.0, 0.0, 200.0])
     rods = [Rod(model, straight(model), [0]) for _ in range(2)]
     rods[1].state.v[:] = rods[1].state._v_before[:] = w
+    watches = [Watch(rod) for rod in rods]
     for k in range(1, 21):
         rods[1].held.target[0] = 0.01 * k * w
-        for rod in rods:
-            rod.go(0.01)
+        for watch in watches:
+            watch.tick(0.01)
     moved = rods[1].x - 0.2 * w
     assert np.max(np.abs(moved - rods[0].x)) <= 1e-6 * model.length
     rest, seen = energy(model, rods[0].x, rods[0].v, np.zeros(3)), energy(model, moved, rods[1].v, w)
     weight = model.mass * model.length * 9810.0 * model.length
     assert abs(seen - rest) <= 1e-5 * weight
     assert abs(energy(model, moved, rods[1].v, np.zeros(3)) - rest) > ERROR * weight, "the frame makes no difference"
+    assert abs(watches[1].gained - watches[0].gained) <= 1e-5
 
 
 def test_a_chain_on_rest_keeps_its_energy_and_is_watched_only_there() -> None:
