@@ -79,6 +79,38 @@ def test_vessels_that_no_tick_can_hold_are_told(report: Path) -> None:
     assert choice.overfull(replace(STITCH, tick_hz=500.0), found).endswith("less 'layers' or 'around' are faster")
 
 
+def large(layers: int, around: int, vessels: int = 2) -> Task:
+    spec = tuple(replace(v, layers=layers, around=around) for v in STITCH.scene.vessel[:vessels])
+    return replace(STITCH, scene=replace(STITCH.scene, vessel=spec))
+
+
+def test_a_vessel_beyond_twice_the_measured_size_is_told(report: Path) -> None:
+    """Measured: 1000 nodes. 2000 are within, 2016 are not; a smaller vessel beside does not hide it."""
+    within, not_within = chosen(report, KEPT, large(25, 40)), chosen(report, KEPT, large(42, 24))
+    assert (within.beyond_nodes, choice.beyond(within), choice.beyond(None)) == (0, "", "")
+    assert not_within.beyond_nodes == 2016
+    assert choice.beyond(not_within).startswith("a vessel has 2016 nodes, more than 2 times as many as any that")
+    mixed = (STITCH.scene.vessel[0], replace(STITCH.scene.vessel[1], layers=42, around=24))
+    task = replace(STITCH, scene=replace(STITCH.scene, vessel=mixed))
+    assert chosen(report, KEPT, task).beyond_nodes == 2016
+
+
+def test_a_frame_that_was_timed_at_a_nearer_size_is_believed(report: Path) -> None:
+    """There the case of the choice was not measured, another kind of tracking was: 700 ms of 20 000 nodes, not 20 x 2.
+
+    Two vessels of 20 200 nodes then take 1414 ms. The choice itself, and small vessels' time, are as they were.
+    """
+    other = row("kept factor", "to 0.1 mN", 700.0, 0.1, size=20_000, case="tracking, both ends clamped")
+    faster = row("sweeps", "to 0.1 mN", 7.0, 0.1, size=20_000, case="tracking, both ends clamped")
+    rows, task = [*KEPT, other, faster], large(101, 100)
+    found = chosen(report, rows, task)
+    assert (found.nodes, found.measured_ms, found.timed_nodes, found.timed_ms) == (1000, 2.0, 20_000, 700.0)
+    assert found.beyond_nodes == 20_200
+    assert "expected to take 1414 ms or more" in choice.overfull(task, found)
+    assert "(700 ms were measured at 20000 nodes)" in choice.overfull(task, found)
+    assert chosen(report, rows) == chosen(report, KEPT)
+
+
 def test_a_force_that_is_left_over_counts_too(report: Path) -> None:
     """A budget of 0.2 mN lets the first setting pass, just; less of it does not, wherever the nodes may be."""
     near = [row("kept factor", "to 0.01 (0.2 mN)", 1.0, 1e-6), *KEPT[1:]]

@@ -19,7 +19,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,10 @@ from trainer.data_files import data_folder
 CASE = "tracking, cut free"
 #: The rows that are like a scene's thread: 100 mm of suture, one end of which is led around a loop in a second.
 THREAD_CASE, THREAD_METHOD = "drag, suture", "follow-the-leader"
+#: Cases whose frames cost alike: where that one was not measured at a size, another one may have been timed there.
+TRACKING = "tracking, "
+#: A vessel of so many times the nodes of any that was measured is beyond the report.
+BEYOND = 2.0
 #: Methods that a scene's tissue can run on.
 RUNNABLE = ("kept factor",)
 #: The vessel of these rows (``trainer/bench/vessel.py``): outer radius and wall in mm, modulus in kPa.
@@ -65,6 +69,9 @@ class Choice(Measured):
     cheapest: Measured  # of all methods that meet the budget; another one than chosen is one that no scene runs on
     model_error: dict[str, float]  # under each load that was measured, a share; empty where the report has none
     model_error_of: str  # what these are shares of, and on which mesh
+    timed_nodes: int  # of the vessel nearest in size on which frames of the method were timed, in whatever tracking …
+    timed_ms: float  # … and the median of these
+    beyond_nodes: int = 0  # of the task's largest vessel that is beyond what was measured; 0 where none is
 
 
 def report_path() -> Path:
@@ -84,24 +91,37 @@ def choose_tissue(task: Task, name: str, report: Path | None = None) -> Choice |
     path = report or report_path()
     rows = _tissue_rows(path)
     choices = [_for_vessel(vessel, task.solver, rows, name, path) for vessel in task.scene.vessel]
-    return min(choices, key=lambda choice: choice.tolerance_mN)
+    chosen = min(choices, key=lambda choice: choice.tolerance_mN)
+    return replace(chosen, beyond_nodes=max(choice.beyond_nodes for choice in choices))
+
+
+def beyond(choice: Choice | None) -> str:
+    """One line where a vessel is so large that no measurement speaks of its error, "" where none is."""
+    if choice is None or choice.beyond_nodes == 0:
+        return ""
+    return (
+        f"a vessel has {choice.beyond_nodes} nodes, more than {BEYOND:g} times as many as any that the choice was "
+        f"measured on ({choice.source}): whether it keeps 'solver.node_error_mm' there is not known"
+    )
 
 
 def overfull(task: Task, choice: Choice | None) -> str:
     """One line where a tick of the task cannot hold its vessels, "" where it can.
 
-    The measured time of a frame is carried over in proportion to the nodes of all vessels, which are solved together: a
-    lower bound, since a direct solver's work grows faster, and a tick may be taken in several movements.
+    The time of a frame at the nearest size at which any was measured is carried over in proportion to the nodes of all
+    vessels, which are solved together: a lower bound where they have more, since a direct solver's work grows faster,
+    and a tick may be taken in several movements.
     """
     if choice is None:
         return ""
     nodes = sum(2 * v.layers * v.around for v in task.scene.vessel)
-    expected_ms, tick_ms = choice.measured_ms * nodes / choice.nodes, 1000.0 / task.tick_hz
+    expected_ms, tick_ms = choice.timed_ms * nodes / choice.timed_nodes, 1000.0 / task.tick_hz
     if expected_ms <= tick_ms:
         return ""
     return (
         f"the vessels have {nodes} nodes: a tick is expected to take {expected_ms:.0f} ms or more, the task gives it "
-        f"{tick_ms:g} ms ({choice.source}); getting ready may take minutes, and less 'layers' or 'around' are faster"
+        f"{tick_ms:g} ms ({choice.timed_ms:.3g} ms were measured at {choice.timed_nodes} nodes); getting ready may "
+        "take minutes, and less 'layers' or 'around' are faster"
     )
 
 
@@ -150,14 +170,14 @@ def _rows(path: Path, wanted: Callable[[dict[str, Any]], bool]) -> list[dict[str
 
 
 def _tissue_rows(path: Path) -> list[dict[str, Any]]:
-    """The rows of the case that converged to a force, with errors in radii of the vessel. Raises ConfigError."""
+    """The rows of tracking that converged to a force, with errors in radii of the vessel. Raises ConfigError."""
 
     def like_a_task(row: dict[str, Any]) -> bool:
-        of_radii = row["case"] == CASE and row["status"] == "converged" and "radii" in row["error_of"]
-        return of_radii and FORCE.search(row["setting"]) is not None
+        tracked = row["case"].startswith(TRACKING) and row["status"] == "converged" and "radii" in row["error_of"]
+        return tracked and FORCE.search(row["setting"]) is not None
 
     rows = _rows(path, like_a_task)
-    if not any(row["method"] in RUNNABLE for row in rows):
+    if not any(row["case"] == CASE and row["method"] in RUNNABLE for row in rows):
         raise ConfigError(
             f"{path}: no {' or '.join(RUNNABLE)} converged in '{CASE}'; `trainer bench speed-error` measures it"
         )
@@ -167,10 +187,10 @@ def _tissue_rows(path: Path) -> list[dict[str, Any]]:
 def _for_vessel(vessel: VesselSpec, budget: SolverSpec, rows: list[dict[str, Any]], name: str, path: Path) -> Choice:
     nodes = 2 * vessel.layers * vessel.around
     # What can be chosen must have been measured at this size; the report may hold others without it.
-    sizes = {row["size"] for row in rows if row["method"] in RUNNABLE}
-    nearest = min(sizes, key=lambda size: max(size / nodes, nodes / size))
+    sizes = {row["size"] for row in rows if row["case"] == CASE and row["method"] in RUNNABLE}
+    nearest = _nearest(sizes, nodes)
     source = f"{path.name}, '{CASE}', {nearest} nodes"
-    here = [_measured(row, vessel) for row in rows if row["size"] == nearest]
+    here = [_measured(row, vessel) for row in rows if row["case"] == CASE and row["size"] == nearest]
     enough = [
         m
         for m in here
@@ -186,9 +206,24 @@ def _for_vessel(vessel: VesselSpec, budget: SolverSpec, rows: list[dict[str, Any
         )
     chosen, cheapest = (min(group, key=lambda m: m.measured_ms) for group in (able, enough))
     errors, of = _model_error(vessel, path)
+    timed = [(row["size"], row["median_ms"]) for row in rows if row["method"] == chosen.method]
+    timed_nodes = _nearest({nearest, *(size for size, _ in timed)}, nodes)
     return Choice(
-        **vars(chosen), budget=budget, source=source, cheapest=cheapest, model_error=errors, model_error_of=of
+        **vars(chosen),
+        budget=budget,
+        source=source,
+        cheapest=cheapest,
+        model_error=errors,
+        model_error_of=of,
+        timed_nodes=timed_nodes,
+        timed_ms=chosen.measured_ms if timed_nodes == nearest else min(ms for size, ms in timed if size == timed_nodes),
+        beyond_nodes=nodes if nodes > BEYOND * nearest else 0,
     )
+
+
+def _nearest(sizes: set[int], nodes: int) -> int:
+    """The size of the nearest ratio to ``nodes``."""
+    return min(sizes, key=lambda size: max(size / nodes, nodes / size))
 
 
 def _model_error(vessel: VesselSpec, path: Path) -> tuple[dict[str, float], str]:

@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import math
-import sys
-from collections.abc import Callable
 
 import numpy as np
 import pytest
-from conftest import CommandLine
 from scipy.integrate import solve_ivp
 
-from trainer.bench import peers, thread
-from trainer.bench.hard_thread import cases
-from trainer.bench.rows import Row
+from trainer.bench import thread
 from trainer.geometry import Array
 from trainer.mechanics.thread_rod import RodModel
 
@@ -74,42 +68,3 @@ def test_rows_say_what_was_measured(monkeypatch: pytest.MonkeyPatch) -> None:
         if row.method == "chain":
             assert row.residual <= 1e-9
             assert row.error <= 1e-4
-
-
-def test_peers_that_are_missing_are_said_to_be(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(thread, "SECONDS", 0.1)
-    for name in ("mujoco", "elastica"):
-        monkeypatch.setitem(sys.modules, name, None)
-    rows = peers.measure(10)
-    missing = [r for r in rows if r.frames == 0]
-    assert [r.status for r in missing] == [
-        "not measured: mujoco is not installed",
-        "not measured: elastica is not installed",
-    ]
-    assert {r.method for r in rows if r.frames} == {"rod", "chain"}
-
-
-def test_the_command_prints_what_was_measured_and_what_is_missing(
-    monkeypatch: pytest.MonkeyPatch, command_line: CommandLine
-) -> None:
-    rows = [Row(peers.CASE, 50, "chain", "-", 9, 0.02, 0.03, 1e-5, "reference", 0.0, "converged", "length")]
-    missing = peers.MISSING.format("mujoco")
-    nan = float("nan")
-    rows.append(Row(peers.CASE, 50, "mujoco", "-", 0, nan, nan, nan, missing, nan, missing))
-    monkeypatch.setattr(peers, "measure", lambda: rows)
-    code, out, _ = command_line("bench", "peers", "--json")
-    assert code == 0
-    assert [(r["method"], r["median_ms"]) for r in json.loads(out)["rows"]] == [("chain", 0.02), ("mujoco", None)]
-    code, out, _ = command_line("bench", "peers")
-    assert code == 0
-    assert missing in out
-
-
-@pytest.mark.parametrize(("case", "method", "run"), cases(), ids=lambda value: value if isinstance(value, str) else "")
-def test_hard_cases_hold(case: str, method: str, run: Callable[[], str]) -> None:
-    assert case
-    assert method
-    outcome = run()
-    # Five hundred contacts are at the edge of the rod's Newton: of all cases the heap alone may say that it stalled.
-    stalled = case.endswith("heap") and outcome.startswith("not converged: no substep")
-    assert stalled or outcome.startswith(("ok: ", "refused: ")), outcome

@@ -368,6 +368,11 @@ def test_bad_input_is_named() -> None:
         follow(model, straight(model), np.array([5.0, 6.0]), np.zeros((3, 3)), model.whole())
     with pytest.raises(ValueError, match="finite"):
         follow(model, straight(model), np.array([np.nan]), np.zeros((1, 3)), model.whole())
+    x = straight(model)
+    for bad in (np.nan, np.inf):
+        with pytest.raises(ValueError, match="place is not finite"):
+            follow(model, x, np.array([5.0]), np.array([[0.0, bad, 0.0]]), model.whole())
+    assert np.array_equal(x, straight(model))
     with pytest.raises(ValueError, match=r"shape \(10, 3\)"):
         follow(model, np.zeros((9, 3)), np.array([5.0]), np.zeros((1, 3)), model.whole())
     for wrong in ((-1.0, D, 10), (LN, 0.0, 10), (LN, np.nan, 10), (LN, D, 1)):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from round_jaws import touch_capsules
@@ -183,3 +185,52 @@ def test_more_contacts_than_room_is_said() -> None:
     axis = np.array([[0.0, -3.0, 0.0], [0.0, 3.0, 0.0]])
     with pytest.raises(ContactsFull, match="more room"):
         touch_capsules(no_contacts(1), x, x, RADIUS, axis, axis, np.array([0.2]), all_pairs(40, 1), 0.2, 5.0)
+
+
+def roof(turn: float) -> tuple[Array, np.ndarray]:
+    """Two triangles that meet along y at the origin, each going down by ``turn`` to its side."""
+    side = np.array([math.cos(turn), 0.0, -math.sin(turn)])
+    x = np.array([[0.0, -5, 0], [0, 5, 0], 5.0 * side, 5.0 * side * [-1, 1, 1]])
+    return x, np.array([[0, 2, 1], [0, 1, 3]], dtype=np.int32)
+
+
+@pytest.mark.parametrize("turn", [0.1, 0.5, 1.2])
+def test_a_link_round_an_edge_stays_outside_of_both_sides(turn: float) -> None:
+    """Half of it is behind the one side's plane and half behind the other's, and it is through neither: all push up.
+
+    A link that goes through a side is pushed back to where its middle is, up or down.
+    """
+    surface, triangles = roof(turn)
+    pairs = all_pairs(2, 2)
+    across = np.array([[-0.1, 0.0, 0.02], [0.02, 0.0, 0.02], [0.12, 0.0, 0.02]])
+    contacts = no_contacts(100)
+    touch_triangles(contacts, across, RADIUS, surface, surface, triangles, pairs, 0.0, 0.5)
+    used = int(contacts.used[0])
+    assert used >= 4
+    assert (contacts.normal[:used, 2] > 0.0).all()
+    for height, way in ((0.03, 1.0), (-0.03, -1.0)):
+        middle = np.array([1.0, 0.0, -math.tan(turn) + height])
+        through = middle + np.outer([-1.0, 1.0, 3.0], [0.0, 0.0, 0.05])
+        clear(contacts)
+        touch_triangles(contacts, through, RADIUS, surface, surface, triangles[:1], all_pairs(1, 1), 0.0, 0.5)
+        used = int(contacts.used[0])
+        assert used > 0
+        assert (np.sign(contacts.normal[:used, 2]) == way).all()
+
+
+def test_a_thread_that_falls_across_a_ridge_hangs_over_it() -> None:
+    """No node's skin is deeper in a side than a hundredth of its radius, since contacts are found once a tick."""
+    surface, triangles = roof(0.6)
+    count = 41
+    x = np.stack([np.linspace(-1.0, 1.0, count), 0.01 * np.arange(count), np.full(count, 0.05)], axis=1)
+    model = RodModel(count, float(np.linalg.norm(x[1] - x[0])), 5.6e-10, 1e-6, 1e3, 5.9e-8)
+    state, nothing, contacts = begin(model, x), holds(model, [], np.zeros((0, 3))), no_contacts(1000)
+    pairs = all_pairs(count - 1, 2)
+    for _ in range(60):
+        clear(contacts)
+        touch_triangles(contacts, state.x, RADIUS, surface, surface, triangles, pairs, 0.3, 0.2)
+        step(state, nothing, TICK, 0.0, contacts)
+        assert length_error(model, state) <= 1e-6
+        below = np.abs(state.x[:, 0]) * math.tan(0.6) + state.x[:, 2]
+        assert below.min() * math.cos(0.6) >= 0.99 * RADIUS * math.cos(0.6)
+    assert state.x[:, 2].min() < -0.2, "it did not hang over"

@@ -36,11 +36,11 @@ JUMP_MM = 20.0
 BRANCH = 1e-2
 
 
-def _task(name: str) -> Task:
+def task_of(name: str) -> Task:
     return load_task(f"anastomosis/{name}").task
 
 
-def _poses(s: Scene, tool: int, position: Array, closure: float) -> ToolPoses:
+def instruments(s: Scene, tool: int, position: Array, closure: float) -> ToolPoses:
     """The instruments where they are, but ``tool`` at ``position`` with its jaws at ``closure``."""
     now = s.view().poses
     place, jaws = now.position.copy(), now.closure.copy()
@@ -48,18 +48,18 @@ def _poses(s: Scene, tool: int, position: Array, closure: float) -> ToolPoses:
     return ToolPoses(place, now.quaternion, jaws, np.ones(2, dtype=bool))
 
 
-def _at(s: Scene, tool: int) -> Array:
+def place_of(s: Scene, tool: int) -> Array:
     return np.array(s.view().poses.position[tool])
 
 
 def _go(s: Scene, tool: int, to: Array, closure: float, step_mm: float) -> list[Event]:
     """Move an instrument straight to a place, ``step_mm`` at a tick, until the exercise ends."""
-    start = _at(s, tool)
+    start = place_of(s, tool)
     ticks = max(1, math.ceil(math.dist(to, start) / step_mm))
     events: list[Event] = []
     for k in range(1, ticks + 1):
         if not s.outcome:
-            events += step(s, _poses(s, tool, start + k / ticks * (to - start), closure))
+            events += step(s, instruments(s, tool, start + k / ticks * (to - start), closure))
     return events
 
 
@@ -68,7 +68,7 @@ def _close(s: Scene, tool: int, closure: float) -> list[Event]:
     return [
         e
         for k in range(1, ticks + 1)
-        for e in step(s, _poses(s, tool, _at(s, tool), start + k / ticks * (closure - start)))
+        for e in step(s, instruments(s, tool, place_of(s, tool), start + k / ticks * (closure - start)))
     ]
 
 
@@ -77,9 +77,36 @@ def _kinds(events: list[Event]) -> str:
     return ", ".join(f"{kinds.count(k)} {k}" for k in dict.fromkeys(kinds)) or "nothing"
 
 
+def two_in_one_triangle() -> str:
+    """A second pass where the first left its thread: both hulls are pierced again, each within one triangle's reach.
+
+    In the outer hull both holes are on the same three nodes. Thread and needle then hold the wall at two places that
+    three nodes carry, and in the end no other node is out of balance.
+    """
+    task = task_of("single-stitch")
+    first = replace(task.step[0], clock_deg=4.0, bite_mm=0.33)
+    again = replace(first, name="again", clock_deg=5.0, bite_mm=0.34)
+    task = replace(task, step=(first, again))
+    s = scene.build(task)
+    hands, events = ScriptedHands(Hand(), task, s.home, 0), list[Event]()
+    while not s.outcome:
+        seen = hands.poll(s.tick, s.view())
+        assert seen is not None, f"the hand stopped: {hands.summary()['stopped']}"
+        events += step(s, seen)
+    made = [(e.wall, e.pass_number) for e in events if isinstance(e, Pierce)]
+    assert made == [("outer", 1), ("inner", 1), ("outer", 2), ("inner", 2)], f"holes {made}"
+    holes = [h for h in s.world.open_holes() if h.place.wall == "outer"]
+    assert len(holes) == 2, f"{len(holes)} holes are open"
+    assert set(holes[0].place.nodes.tolist()) == set(holes[1].place.nodes.tolist()), "they are in two triangles"
+    for _ in range(100):
+        events += step(s, s.view().poses)
+    apart = math.dist(holes[0].place.weights, holes[1].place.weights)
+    return f"ok: {_kinds(events)}; weights {apart:.2f} apart; {settled(s):.0e} mN unbalanced in the end"
+
+
 def _needle_in_wall(name: str) -> Scene:
     """A scripted hand has driven the needle through both hulls of a wall."""
-    task = _task(name)
+    task = task_of(name)
     s = scene.build(task)
     hands = ScriptedHands(Hand(), task, s.home, 0)
     while not s.steps_done:
@@ -91,7 +118,7 @@ def _needle_in_wall(name: str) -> Scene:
 
 def _threaded() -> Scene:
     """Both instruments hold the thread, 4 mm of it between them; the needle is dropped."""
-    s = scene.build(_task("single-stitch"))
+    s = scene.build(task_of("single-stitch"))
     _go(s, LEFT, s.world.nodes[40].copy(), 0.0, 0.5)
     _close(s, LEFT, 1.0)
     _close(s, RIGHT, 0.0)
@@ -107,12 +134,12 @@ def jump(name: str, direction: tuple[float, float, float]) -> str:
     In the end the tissue is in equilibrium, to ``SETTLED_mN`` at every node that nothing holds.
     """
     s = _needle_in_wall(name)
-    here, events = _at(s, RIGHT), list[Event]()
+    here, events = place_of(s, RIGHT), list[Event]()
     way = s.world.world_from_scene.rotate(s.world.needle_pose.rotate(np.array(direction)))
     for place in (here + JUMP_MM * way, here):
         for _ in range(100):
             if not s.outcome:
-                events += step(s, _poses(s, RIGHT, place, 1.0))
+                events += step(s, instruments(s, RIGHT, place, 1.0))
     return f"ok: {_kinds(events)}; {settled(s):.0e} mN unbalanced in the end"
 
 
@@ -121,10 +148,10 @@ def pulled_apart(closure: float, step_mm: float) -> str:
     s = _threaded()
     for tool in (LEFT, RIGHT):
         _close(s, tool, closure)
-    between = _at(s, RIGHT) - _at(s, LEFT)
-    _go(s, RIGHT, _at(s, LEFT) + 0.7 * between, closure, 0.05)
+    between = place_of(s, RIGHT) - place_of(s, LEFT)
+    _go(s, RIGHT, place_of(s, LEFT) + 0.7 * between, closure, 0.05)
     assert s.view().thread_holders == (LEFT, RIGHT), "the thread was lost while it was slack"
-    events = _go(s, RIGHT, _at(s, LEFT) + max(1.1, 0.7 + step_mm) * between, closure, step_mm)
+    events = _go(s, RIGHT, place_of(s, LEFT) + max(1.1, 0.7 + step_mm) * between, closure, step_mm)
     found, ending = [e.kind for e in events if e.kind in ("break", "slip")], "break" if closure == 1.0 else "slip"
     assert found == [ending], f"it ended in {found}, not in one {ending}"
     return f"ok: {_kinds(events)}; lengths to {thread_pull.stretch(s.world):.0e}"
@@ -132,7 +159,7 @@ def pulled_apart(closure: float, step_mm: float) -> str:
 
 def grazing(name: str) -> str:
     """The needle slides along the top of the vessel at 2 degrees, 1.5 mm far: 0.05 mm deep, which is no puncture."""
-    s = scene.build(_task(name))
+    s = scene.build(task_of(name))
     needle = s.world.needle
     assert needle is not None
     point, normal = s.view().look("A", 0.0, 0.6, "outer")
@@ -157,7 +184,7 @@ def grazing(name: str) -> str:
 
 def _drive(tick_hz: float) -> Pierce:
     """One drive by a hand without fault: both hulls, once each."""
-    task = _task("needle-drive")
+    task = task_of("needle-drive")
     task = replace(task, step=task.step[:1], tick_hz=tick_hz)
     s = scene.build(task)
     hands, events = ScriptedHands(Hand(), task, s.home, 0), list[Event]()
@@ -216,9 +243,9 @@ def bad_poses(spoil: Callable[[ToolPoses], ToolPoses]) -> str:
     ends = []
     for spoilt in (True, False):
         s = _needle_in_wall("single-stitch")
-        held, events, here = s.view().poses, list[Event](), _at(s, RIGHT)
+        held, events, here = s.view().poses, list[Event](), place_of(s, RIGHT)
         for k in range(40):
-            good = _poses(s, RIGHT, here + 0.01 * k * np.array([0.0, 0.0, 1.0]), 1.0)
+            good = instruments(s, RIGHT, here + 0.01 * k * np.array([0.0, 0.0, 1.0]), 1.0)
             lost = replace(good, valid=np.arange(2) != RIGHT, reason=tuple(NO_POSE * (i == RIGHT) for i in range(2)))
             seen = good if k >= 20 else admit(spoil(good), held) if spoilt else lost
             events += step(s, seen)
@@ -254,7 +281,7 @@ def _pushed(depth: float, step_mm: float) -> tuple[list[Event], Array]:
     They hold it, or it slips or tears. Held, the tissue comes to equilibrium, and has no more energy than if nothing
     but the held nodes had moved; let go, it goes back to rest.
     """
-    s = scene.build(_task("needle-drive"))
+    s = scene.build(task_of("needle-drive"))
     world = s.world
     assert world.solver is not None
     place, normal = s.view().look("A", 90.0, 0.6, "outer")
@@ -266,7 +293,7 @@ def _pushed(depth: float, step_mm: float) -> tuple[list[Event], Array]:
     radius = 0.5 * world.task.scene.vessel[0].outer_diameter_mm
     events = _go(s, LEFT, place - depth * radius * normal, 1.0, step_mm)
     for _ in range(100):
-        events += step(s, _poses(s, LEFT, _at(s, LEFT), 1.0))
+        events += step(s, instruments(s, LEFT, place_of(s, LEFT), 1.0))
     settled(s)
     if jaw.target == "wall":
         moved = mesh.rest.copy()
@@ -305,6 +332,7 @@ def cases() -> list[tuple[str, str, Callable[[], str]]]:
             case = f"{jaws} jaws draw the thread apart by {stride:g} mm a tick"
             found.append((case, "single-stitch", partial(pulled_apart, closure, stride)))
     found += [("needle grazes the wall at 2 degrees", t, partial(grazing, t)) for t in tasks]
+    found.append(("thread and needle through one triangle", "single-stitch", two_in_one_triangle))
     found += [(f"ticks of {1e3 / hz:g} ms", "needle-drive", partial(ticks, hz)) for hz in (1000.0, 20.0)]
     found += [(f"poses with {bad}", "single-stitch", partial(bad_poses, spoil)) for bad, spoil in BAD_POSES.items()]
     found.append(("poses with a denormal place", "single-stitch", denormal_place))

@@ -2,11 +2,22 @@
 
 The law of all of them: the state is finite; a method that says it converged is in equilibrium (the residual is measured
 here again), has no more energy than where the instrument put it, and is on the branch to which small steps lead where
-the way there matters. Every jump is followed in sub-steps, as ``mechanics.path_following`` chooses them.
+the way there matters. Every jump is followed in sub-steps, as ``mechanics.path_following`` chooses them, to 1e-4 mN.
+
+*Kept factor* so has up to 300 iterations a sub-step and holds of 1e6 mN/mm: it is what the method can do. *As in the
+scene* is what a session does of it: the jump is one tick, divided into movements as ``scene`` does it, each with the
+few iterations, the tolerance and a jaw's holds of ``interactions.holding`` (0.01 mN, 7500 mN/mm); then the instrument
+rests for a second. It answers when a tick says that it converged, and how long that took is told; until then the scene
+judges nothing by its forces.
+
+Thresholds: the residual may be ten times the tolerance, since methods measure it while they sweep, or at other nodes'
+places; on the right branch the answer is nearer than 0.01 R, other branches being 0.2 R and more away; held nodes are
+off by what they pull with over the hold's stiffness, and what is drawn with them as far.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -17,6 +28,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from trainer.bench.vessel import Work, prepare, residual_mN
 from trainer.geometry import Array
+from trainer.interactions.holding import HOLD, MOST_ITERATIONS, TOLERANCE_MN
 from trainer.mechanics.attachments import Anchors
 from trainer.mechanics.equilibrium import Equilibrium
 from trainer.mechanics.krylov import NewtonKrylov
@@ -25,8 +37,9 @@ from trainer.mechanics.newton import Newton, Outcome
 from trainer.mechanics.path_following import Follower, follow
 from trainer.mechanics.relaxation import relax
 from trainer.mechanics.sweeps import BlockSweeps
+from trainer.scene import MOST_MOVEMENTS, STRIDE_MM
 
-#: Residual, mN, at which a method may say that it converged. The program's own is 1e-3.
+#: Residual, mN, at which a method may say that it converged; the scene's own is 1e-2.
 TOLERANCE_mN = 1e-4
 #: … and by how much its own measure may differ from ours: the relaxation measures while it sweeps.
 MEASURED = 10.0
@@ -34,6 +47,10 @@ MEASURED = 10.0
 BRANCH = 1e-2
 #: The kept factor draws nodes by springs, mN/mm, which give way by what the links pull there.
 SPRING = 1e6
+#: A jaw's hold of the vessel of these cases (``bench/vessel.py``: 500 kPa, 0.15 mm), mN/mm; see ``holding.grips``.
+SCENE_SPRING = HOLD * 500.0 * 0.15
+#: A second of rest after a jump, ticks.
+RESTS = 100
 #: Sub-steps of the reference for a way of one radius.
 FINE = 200
 
@@ -51,7 +68,9 @@ class Relaxation:
 
 
 class KeptFactor:
-    """What the program runs at every tick; it draws nodes by stiff springs."""
+    """The method of the scene, which draws nodes by springs; as ``path_following`` leads it, until it has converged."""
+
+    spring, most_iterations = SPRING, 300
 
     def __init__(self, mesh: LinkMesh) -> None:
         free = np.flatnonzero(~mesh.fixed).astype(np.int32)
@@ -68,9 +87,15 @@ class KeptFactor:
             if node not in self._slots:
                 self._slots[node] = self._state.hold(np.full(3, node), np.array([1.0, 0.0, 0.0]))
         slots = np.array([self._slots[node] for node in nodes.tolist()])
-        held = Anchors(slots, places, np.repeat(SPRING * np.eye(3)[None], len(nodes), axis=0))
-        ended = self._state.solve(held, tolerance_mN=tolerance_mN, max_iterations=300)
+        held = Anchors(slots, places, np.repeat(self.spring * np.eye(3)[None], len(nodes), axis=0))
+        ended = self._state.solve(held, tolerance_mN=tolerance_mN, max_iterations=self.most_iterations)
         return Outcome(ended.converged, ended.iterations, ended.residual_mN, energy(self.mesh, self.x))
+
+
+class AsInScene(KeptFactor):
+    """The same with the scene's holds and iterations; see ``through_ticks``."""
+
+    spring, most_iterations = SCENE_SPRING, MOST_ITERATIONS
 
 
 def _adjacency(mesh: LinkMesh) -> csr_matrix:
@@ -79,11 +104,13 @@ def _adjacency(mesh: LinkMesh) -> csr_matrix:
     return csr_matrix((np.ones(2 * len(i)), pairs), shape=(len(mesh.rest), len(mesh.rest)))
 
 
-#: Each as it is followed along a jump, see mechanics.path_following.
+SCENE = "kept factor, as in the scene"
+#: Each as it is followed along a jump: the scene's in its movements, all others as mechanics.path_following does.
 METHODS: dict[str, Callable[[LinkMesh], Follower]] = {
     "relaxation": Relaxation,
     "block sweeps": BlockSweeps,
     "kept factor": KeptFactor,
+    SCENE: AsInScene,
     "Newton, SuperLU": Newton,
     "Newton–Krylov": NewtonKrylov,
 }
@@ -199,12 +226,44 @@ def _reference(case: str) -> Array:
     return method.x
 
 
+def through_ticks(method: AsInScene, nodes: np.ndarray, places: Array) -> int:
+    """A jump in one tick, in the scene's movements, and ticks at rest until one converges: how many, or -1."""
+    start = method.x[nodes].copy()
+    longest = float(np.max(np.linalg.norm(places - start, axis=1)))
+    movements = min(MOST_MOVEMENTS, max(1, math.ceil(longest / STRIDE_MM))) if math.isfinite(longest) else 1
+    for m in range(1, movements + 1):
+        ended = method.move(nodes, start + (places - start) * (m / movements), tolerance_mN=TOLERANCE_MN)
+    for tick in range(RESTS + 1):
+        if ended.converged:
+            return tick
+        ended = method.move(nodes, places, tolerance_mN=TOLERANCE_MN)
+    return -1
+
+
+def _gone(follower: Follower, hard: HardCase) -> tuple[str, str]:
+    """Takes the nodes along all ways: in words how that went, and how it did not."""
+    waited = []
+    for places in hard.ways:
+        if isinstance(follower, AsInScene):
+            ticks = through_ticks(follower, hard.nodes, places)
+            if ticks < 0:
+                return "", f"nor {RESTS} ticks after a jump"
+            waited.append(ticks)
+        else:
+            path = follow(follower, hard.nodes, places, tolerance_mN=TOLERANCE_mN)
+            if not path.converged:
+                return "", f"stays at {path.share:.0%} of a way"
+    return (f", {max(waited)} ticks after the jump" if waited else ""), ""
+
+
 def outcome(case: str, method: str) -> str:
     """What the method did. Raises AssertionError when it broke the law: NaN, a leap, a silent wrong answer."""
     hard = CASES[case]()
+    in_scene = method == SCENE
+    tolerance, spring = (TOLERANCE_MN, SCENE_SPRING) if in_scene else (TOLERANCE_mN, SPRING)
     try:
         follower = METHODS[method](hard.mesh)
-        ended = [follow(follower, hard.nodes, places, tolerance_mN=TOLERANCE_mN) for places in hard.ways]
+        words, stopped = _gone(follower, hard)
     except ValueError as refusal:
         return f"refused: {refusal}"
     x = follower.x
@@ -213,20 +272,23 @@ def outcome(case: str, method: str) -> str:
     assert np.max(np.abs(x)) <= 2.0 * size, "a node has flown off"
     free = np.setdiff1d(np.flatnonzero(~hard.mesh.fixed), hard.nodes)
     left = residual_mN(hard.mesh, x, free)
-    if stopped := [path for path in ended if not path.converged]:
-        return f"not converged: stays at {stopped[0].share:.0%} of a way, residual there {left:.1e} mN"
+    if stopped:
+        return f"not converged: {stopped}, residual there {left:.1e} mN"
     off = np.linalg.norm(x[hard.nodes] - hard.ways[-1], axis=1)
-    give = (np.linalg.norm(forces(hard.mesh, x)[hard.nodes], axis=1) + MEASURED * TOLERANCE_mN) / SPRING
+    give = (np.linalg.norm(forces(hard.mesh, x)[hard.nodes], axis=1) + MEASURED * tolerance) / spring
     assert (off <= give).all(), f"a node is {np.max(off):.1e} mm from where it was taken"
-    assert left <= MEASURED * TOLERANCE_mN, f"residual {left:.1e} mN, and it says that it converged"
+    assert left <= MEASURED * tolerance, f"residual {left:.1e} mN, and it says that it converged"
     moved = hard.mesh.rest.copy()
     moved[hard.nodes] = hard.ways[-1]
-    assert len(ended) > 1 or energy(hard.mesh, x) <= energy(hard.mesh, moved), "more energy than with nothing solved"
+    assert len(hard.ways) > 1 or energy(hard.mesh, x) <= energy(hard.mesh, moved), (
+        "more energy than with nothing solved"
+    )
     if not hard.same_branch:
-        return f"ok: residual {left:.1e} mN"
+        return f"ok: residual {left:.1e} mN{words}"
     error = float(np.max(np.linalg.norm(x - _reference(case), axis=1))) / hard.radius_mm
-    assert error <= BRANCH, f"another branch, {error:.2f} R away, and it says that it converged"
-    return f"ok: {error:.1e} R from small steps"
+    allowed = BRANCH + float(np.max(give)) / hard.radius_mm
+    assert error <= allowed, f"another branch, {error:.2f} R away, and it says that it converged"
+    return f"ok: {error:.1e} R from small steps{words}"
 
 
 def cases() -> list[tuple[str, str, Callable[[], str]]]:

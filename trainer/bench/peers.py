@@ -4,13 +4,19 @@ MuJoCo: the same point masses on massless links with ball joints without frictio
 in a small sphere at its far end, so that the model differs from the reference by the sphere's own inertia, (r / d)².
 PyElastica: a Cosserat rod, pinned at its first node, with as many elements as the chain has links. It stretches and
 bends: its radius and axial stiffness trade that error against the step, which its fastest wave bounds.
+
+A round is a whole swing of each method with each setting, one after the other: frame by frame in turn each would find
+the caches full of the others' numbers, which costs the lightest most. A method's figure is the median over the rounds
+of the round's median frame; ratios are taken within a round, whose swings follow one another within seconds.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import partial
+from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import numpy as np
@@ -23,7 +29,9 @@ from trainer.mechanics.thread_rod import Holds, RodModel, holds
 MUJOCO_STEPS_S = (5e-3, 2e-3, 1e-3, 5e-4)
 ELASTICA = ((10.0, 1e-3), (3.0, 1e-3), (3.0, 5e-4))  # axial stiffness, N, and radius, m
 ELASTICA_STEP = 0.8  # of the shortest time that a wave of stretch takes along, or one of shear across, an element
-ROUNDS = 2
+ROUNDS = 5
+#: Module and distribution of each peer.
+PEERS = {"mujoco": "mujoco", "elastica": "pyelastica"}
 CASE = "swing, bare"
 MISSING = "not measured: {} is not installed"
 
@@ -103,11 +111,30 @@ class Elastica:
         return np.ascontiguousarray(self.rod.position_collection.T) * 1e3
 
 
-def measure(links: int = 50) -> list[Row]:
-    """Rows of the rod, the chain and the peers that are found; of the others rows that say so.
+@dataclass(frozen=True)
+class Swings:
+    """A method with a setting, swung once a round."""
 
-    Whole swings in turn, twice, of which the faster counts: frame by frame in turn each would find the caches full of
-    the others' numbers, which costs the lightest most.
+    row: Row  # its times are medians over the rounds, its error is the worst
+    rounds_ms: tuple[float, ...]  # median frame of each round
+    peer: bool
+
+
+def installed() -> dict[str, str]:
+    """The versions of the peers that are here."""
+    found = {}
+    for distribution in PEERS.values():
+        try:
+            found[distribution] = version(distribution)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def measure(links: int = 50, rounds: int = ROUNDS) -> list[Swings]:
+    """The rod, the chain and the peers that are found, each ``rounds`` times; of the others rows that say so.
+
+    A swing before the first round compiles, and is not counted. The order turns by one from round to round.
     """
     model = thread.bare(links)
     h = thread.reference_step(model, False)
@@ -117,21 +144,31 @@ def measure(links: int = 50) -> list[Row]:
 
     builders: list[tuple[str, Callable[[], thread.Method]]] = []
     builders += [("", partial(thread.Rod, model, held(), t * model.length, True)) for t in (1e-3, 1e-4, 1e-5)]
-    builders += [("", partial(thread.Chain, model, held(), t * model.length)) for t in (1e-3, 1e-5, 1e-6)]
+    builders += [("", partial(thread.Chain, model, held(), t * model.length)) for t in (1e-2, 1e-3, 1e-5, 1e-6)]
     builders += [("mujoco", partial(MuJoCo, model, step_s)) for step_s in MUJOCO_STEPS_S]
     builders += [("elastica", partial(Elastica, model, *setting)) for setting in ELASTICA]
     expected, of = thread.answers(model, thread.still, h), thread.REFERENCE.format(links, h)
-    rows: dict[tuple[str, str], Row] = {}
-    for _ in range(ROUNDS):
-        for name, build in builders:
-            try:
-                method = build()
-            except ImportError:
-                said, nan = MISSING.format(name), float("nan")
-                rows[name, "-"] = Row(CASE, links, name, "-", 0, nan, nan, nan, said, nan, said)
-                continue
-            (row,) = thread.run(CASE, model, thread.still, [method], expected, of)
-            key = row.method, row.setting
-            if key not in rows or row.median_ms < rows[key].median_ms:
-                rows[key] = row
-    return list(rows.values())
+    missing: list[Swings] = []
+    for module in PEERS:
+        try:
+            next(build for name, build in builders if name == module)().frame(np.zeros(3), np.zeros(3))
+        except ImportError:
+            said, nan = MISSING.format(module), float("nan")
+            missing.append(Swings(Row(CASE, links, module, "-", 0, nan, nan, nan, said, nan, said), (), True))
+            builders = [(name, build) for name, build in builders if name != module]
+    for name, build in builders:
+        if not name:
+            thread.run(CASE, model, thread.still, [build()], expected[:3], of)
+    swung: list[list[Row]] = [[] for _ in builders]
+    for turn in range(rounds):
+        for k in np.roll(np.arange(len(builders)), -turn).tolist():
+            swung[k] += thread.run(CASE, model, thread.still, [builders[k][1]()], expected, of)
+    return [_swings(rows, bool(name)) for rows, (name, _) in zip(swung, builders, strict=True)] + missing
+
+
+def _swings(rows: list[Row], peer: bool) -> Swings:
+    ms = tuple(row.median_ms for row in rows)
+    worst = max(rows, key=lambda row: row.error)
+    p90 = float(np.median([row.p90_ms for row in rows]))
+    frames = sum(row.frames for row in rows)
+    return Swings(replace(worst, frames=frames, median_ms=float(np.median(ms)), p90_ms=p90), ms, peer)

@@ -24,6 +24,7 @@ SUBJECTS = {
     "hard_vessel": "Static equilibrium",
     "hard_cut": "Cuts",
     "hard_thread": "The thread",
+    "hard_draped": "The thread on vessels",
     "hard_contact": "Contact search",
     "hard_volume": "Volumes of tissue",
     "hard_scan": "Scans",
@@ -41,6 +42,10 @@ LONG = frozenset(
         ("patch pushed in by 1.2 R in one jump", "Newton, SuperLU"),
         ("collapsed vessel pulled open again", "relaxation"),
         ("collapsed vessel pulled open again", "Newton, SuperLU"),
+        ("held end leaps 20 mm in one tick", "XPBD, substeps of 10 µs"),
+        ("1000 links fall on the vessel in a heap, soft", "rod"),
+        ("1000 links fall on the vessel in a heap, limp", "rod"),
+        ("1000 links wound and heaped on two vessels", "follow-the-leader, draped"),
     }
 )
 
@@ -122,7 +127,8 @@ def markdown(outcomes: Outcomes, about: dict[str, Any], quick: bool) -> str:
         f"Written by `trainer bench stability{' --quick' if quick else ''}`. {in_words(about)}.",
         "",
         "None of these may end in a number that is not finite, in a leap, or in a silent wrong answer. A method may",
-        "refuse a case in one line, or say that it did not converge; *BROKEN* is a law that does not hold. Seconds are",
+        "refuse a case in one line, or say that it did not converge (where a method cannot, its case does); *BROKEN*",
+        "is a law that does not hold. Each section states its laws and where their thresholds come from. Seconds are",
         "those of one run, compilation included where a case is the first to need a kernel. `--quick` leaves out what",
         "takes four seconds or more.",
         "",

@@ -115,7 +115,7 @@ class PaperRelaxation:
 
 
 class KeptFactor:
-    """L-BFGS over the factor of the rest state: what the program runs at every tick."""
+    """L-BFGS over the factor of the rest state, to its end; a scene runs it with fewer iterations and softer holds."""
 
     memory = (0, 0)
 

@@ -154,19 +154,24 @@ def _print_rows(counts: str, rows: Sequence[Row]) -> None:
 
 
 @app.command("peers")
-def swing_beside_peers(as_json: JsonOption = False) -> None:
-    """A swinging chain of 50 links, here and in MuJoCo and PyElastica, where they are installed beside."""
-    from dataclasses import asdict
-
-    from trainer.bench import page, peers
+def swing_beside_peers(out: OutOption = None, as_json: JsonOption = False) -> None:
+    """A swinging chain of 50 links, here and in MuJoCo and PyElastica, if installed beside; writes peers.md, .json."""
+    from trainer.bench import page, peers, peers_page
+    from trainer.bench.machine import load
 
     about = _machine()
-    rows = peers.measure()
+    about["versions"].update(peers.installed())
+    found = peers.measure()
+    about["load_after"] = load()
     if as_json:
-        plain = [{k: None if v != v else v for k, v in asdict(row).items()} for row in rows]  # NaN where not measured
-        print(json.dumps({"rows": plain, "machine": about}, indent=2, allow_nan=False))
+        print(json.dumps(peers_page.document(found, about), indent=2, allow_nan=False))
+    else:
+        _print_rows(page.SUBJECTS["thread"].counts, [s.row for s in found])
+    if not all(s.rounds_ms for s in found):
+        _tell("no report is written where a peer is not installed")
         return
-    _print_rows(page.SUBJECTS["thread"].counts, rows)
+    for path in peers_page.write(_folder(out, False), found, about):
+        typer.echo(f"written: {path}", err=True)
 
 
 @app.command()

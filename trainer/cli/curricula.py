@@ -58,14 +58,15 @@ def check(
 ) -> None:
     """Check files of a curriculum; exit code 1 when something is wrong."""
     from trainer import curriculum
-    from trainer.choice import choose_tissue, overfull
+    from trainer.choice import beyond, choose_tissue, overfull
     from trainer.metrics.registry import check_targets
     from trainer.scene import build
 
     def check_task(task: curriculum.Task) -> None:
         check_targets(task)
-        if slow := overfull(task, choose_tissue(task, task.name)):
-            typer.echo(f"task '{task.name}': {slow}", err=True)
+        tissue = choose_tissue(task, task.name)
+        for doubt in filter(None, (beyond(tissue), overfull(task, tissue))):
+            typer.echo(f"task '{task.name}': {doubt}", err=True)
         build(task)
 
     problems = curriculum.check(path, check_task)

@@ -146,7 +146,7 @@ def _open(stack: ExitStack, asked: Asked, clock: Fast) -> _Session:
         recorder = stack.enter_context(closing(RecorderProcess()))
 
     from trainer.anatomy import library
-    from trainer.choice import choose_tissue, overfull, thread_method
+    from trainer.choice import beyond, choose_tissue, overfull, thread_method
     from trainer.cli.warmup import announce, warm_up
     from trainer.clock import Realtime
     from trainer.drivers import open_driver
@@ -160,8 +160,8 @@ def _open(stack: ExitStack, asked: Asked, clock: Fast) -> _Session:
     task = asked.task_file.task
     check_targets(task)
     tissue = choose_tissue(task, asked.task_file.path)
-    if slow := overfull(task, tissue):
-        typer.echo(f"{asked.task_file.path}: {slow}", err=True)
+    for doubt in filter(None, (beyond(tissue), overfull(task, tissue))):
+        typer.echo(f"{asked.task_file.path}: {doubt}", err=True)
     thread = thread_method(task.scene.thread)
     knee = library.of_task(task.scene.anatomy, asked.anatomy)
     if asked.recording_path is not None:

@@ -83,6 +83,8 @@ def _constraints(arc: Array, position: Array) -> tuple[Array, Array]:
         raise ValueError(f"{len(s)} constraint arcs need positions of shape ({len(s)}, 3), not {p.shape}")
     if not in_order(s):
         raise ValueError("constraints must come in the order of their arcs, which must be finite")
+    if not np.isfinite(p).all():
+        raise ValueError("a constraint's place is not finite")
     return s, p
 
 

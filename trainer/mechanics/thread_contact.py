@@ -67,7 +67,10 @@ def _triangle_point(
     contacts: Contacts, x: Array, i: int, s: float, radius: float, v: Array, v_end: Array, a: int, b: int, c: int,
     wa: float, wb: float, wc: float, side: float, fx: float, fy: float, fz: float, friction: float,
 ) -> bool:  # fmt: skip
-    """A contact of the point ``s`` of link ``i`` with the triangle's point of weights w; f its normal, on ``side``."""
+    """A contact of the point ``s`` of link ``i`` with the triangle's point of weights w.
+
+    ``side`` of the triangle's normal f on which it has to be, or 0 for where it is.
+    """
     qx = wa * v[a, 0] + wb * v[b, 0] + wc * v[c, 0]
     qy = wa * v[a, 1] + wb * v[b, 1] + wc * v[c, 1]
     qz = wa * v[a, 2] + wb * v[b, 2] + wc * v[c, 2]
@@ -79,7 +82,8 @@ def _triangle_point(
     if size > 1e-9 and side * (px * fx + py * fy + pz * fz) >= 0.0:
         nx, ny, nz = px / size, py / size, pz / size
     else:
-        nx, ny, nz = side * fx, side * fy, side * fz
+        way = -1.0 if side < 0.0 else 1.0
+        nx, ny, nz = way * fx, way * fy, way * fz
     return _add(
         contacts, i, -1, s, 0.0, nx, ny, nz, nx * qx + ny * qy + nz * qz + radius,
         wa * v_end[a, 0] + wb * v_end[b, 0] + wc * v_end[c, 0] - qx,
@@ -105,16 +109,42 @@ def _triangles(
         if size == 0.0:
             continue
         fx, fy, fz = fx / size, fy / size, fz / size
-        # The side of the link's middle: a link that crosses the plane goes back to where most of it is.
-        height = 0.0
-        for d in range(2):
-            height += (x[i + d, 0] - v[a, 0]) * fx + (x[i + d, 1] - v[a, 1]) * fy + (x[i + d, 2] - v[a, 2]) * fz
-        side = 1.0 if height >= 0.0 else -1.0
+        # A link that is through the triangle goes back to where its middle is. One that is only through its plane, as
+        # where it goes round an edge to a neighbour, is on no wrong side of it: side 0.
+        start = (x[i, 0] - v[a, 0]) * fx + (x[i, 1] - v[a, 1]) * fy + (x[i, 2] - v[a, 2]) * fz
+        end = (x[i + 1, 0] - v[a, 0]) * fx + (x[i + 1, 1] - v[a, 1]) * fy + (x[i + 1, 2] - v[a, 2]) * fz
+        side = 0.0
+        if (start < 0.0) != (end < 0.0):
+            at = start / (start - end)
+            squared, _, _ = point_triangle(
+                x[i, 0] + at * (x[i + 1, 0] - x[i, 0]),
+                x[i, 1] + at * (x[i + 1, 1] - x[i, 1]),
+                x[i, 2] + at * (x[i + 1, 2] - x[i, 2]), v, a, b, c,
+            )  # fmt: skip
+            if squared <= INTERIOR**2 * size:
+                side = 1.0 if start + end >= 0.0 else -1.0
         # Its first node (its second is the next link's first), and where its inside is nearest to an edge.
-        for end in range(2 if i + 2 == len(x) else 1):
-            squared, wb, wc = point_triangle(x[i + end, 0], x[i + end, 1], x[i + end, 2], v, a, b, c)
+        for node in range(2 if i + 2 == len(x) else 1):
+            squared, wb, wc = point_triangle(x[i + node, 0], x[i + node, 1], x[i + node, 2], v, a, b, c)
             if squared <= near and not _triangle_point(
-                contacts, x, i, float(end), radius, v, v_end, a, b, c, 1.0 - wb - wc, wb, wc, side, fx, fy, fz, friction
+                contacts,
+                x,
+                i,
+                float(node),
+                radius,
+                v,
+                v_end,
+                a,
+                b,
+                c,
+                1.0 - wb - wc,
+                wb,
+                wc,
+                side,
+                fx,
+                fy,
+                fz,
+                friction,
             ):
                 return False
         for edge in range(3):
