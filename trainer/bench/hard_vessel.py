@@ -15,7 +15,8 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from trainer.bench.vessel import Work, prepare, residual_mN
+from trainer.bench.equilibria import residual_mN
+from trainer.bench.vessel import Work, prepare
 from trainer.geometry import Array
 from trainer.mechanics.attachments import Anchors
 from trainer.mechanics.equilibrium import Equilibrium

@@ -55,7 +55,7 @@ class MuJoCo:
         self.data = mujoco.MjData(self.built)
         mujoco.mj_forward(self.built, self.data)
 
-    def frame(self, before: Array, after: Array) -> Array:
+    def frame(self, places: Array) -> Array:
         for _ in range(self.steps):
             self.engine.mj_step(self.built, self.data)
         self.engine.mj_kinematics(self.built, self.data)
@@ -97,7 +97,7 @@ class Elastica:
         self.steps = math.ceil(thread.FRAME_S / (ELASTICA_STEP * shortest))
         self.setting = f"EA {axial:g} N, radius {radius * 1e3:g} mm, {thread.FRAME_S / self.steps:.1e} s"
 
-    def frame(self, before: Array, after: Array) -> Array:
+    def frame(self, places: Array) -> Array:
         for _ in range(self.steps):
             self.time = self.stepper.step(self.simulator, self.time, np.float64(thread.FRAME_S / self.steps))
         return np.ascontiguousarray(self.rod.position_collection.T) * 1e3
@@ -110,7 +110,7 @@ def measure(links: int = 50) -> list[Row]:
     the others' numbers, which costs the lightest most.
     """
     model = thread.bare(links)
-    h = thread.reference_step(model, False)
+    h = thread.reference_step(model)
 
     def held() -> Holds:
         return holds(model, [0], [[0, 0, 0]])
