@@ -6,6 +6,11 @@ scene can run on is another question. Tissue: the kept factor alone, since no ot
 loads; so its tolerance is what is chosen, and a method that would be cheaper is named beside it. Thread: following the
 leader alone, which is exact in its lengths, so there is nothing to choose.
 
+Which of two settings is the faster is noise where they differ by less than the measurement spreads: where the median
+of one is within the 90th percentile of the fastest. Of such settings the one with the largest tolerance is taken: from
+the same start it never takes more iterations than one that asks for less, and a report that was made anew, on another
+day, does not give a task another tolerance.
+
 All that is the error of a solver. That of the model, which is far larger, comes from the same report and is told beside
 it: of the link mesh against the theory of a solid, and of the thread against one with weight, inertia and stiffness.
 
@@ -17,6 +22,7 @@ to modulus times thickness). With other proportions this is an approximation.
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -56,6 +62,7 @@ class Measured:
     setting: str
     nodes: int  # of the vessel that it was measured on
     measured_ms: float  # median of a frame
+    measured_p90_ms: float  # the median where too few frames were timed to tell
     measured_solver_error_mm: float  # largest distance of a node to where it would come to rest
     tolerance_mN: float  # unbalanced force at which a solve ends
 
@@ -66,7 +73,7 @@ class Choice(Measured):
 
     budget: SolverSpec
     source: str  # of the measurement
-    cheapest: Measured  # of all methods that meet the budget; another one than chosen is one that no scene runs on
+    cheapest: Measured  # of all methods that meet the budget; another one than chosen is cheaper, and no scene's
     model_error: dict[str, float]  # under each load that was measured, a share; empty where the report has none
     model_error_of: str  # what these are shares of, and on which mesh
     timed_nodes: int  # of the vessel nearest in size on which frames of the method were timed, in whatever tracking …
@@ -166,7 +173,12 @@ def _rows(path: Path, wanted: Callable[[dict[str, Any]], bool]) -> list[dict[str
     try:
         return [row for row in json.loads(config.read_text(path))["rows"] if wanted(row)]
     except (json.JSONDecodeError, KeyError, TypeError):
-        raise ConfigError(f"{path}: not a report; `trainer bench speed-error` writes one") from None
+        raise ConfigError(f"{path}: not a report; {_again(path)} writes one") from None
+
+
+def _again(path: Path) -> str:
+    """What writes the report where it is looked for."""
+    return f"`trainer bench speed-error --out {path.parent}`"
 
 
 def _tissue_rows(path: Path) -> list[dict[str, Any]]:
@@ -174,13 +186,12 @@ def _tissue_rows(path: Path) -> list[dict[str, Any]]:
 
     def like_a_task(row: dict[str, Any]) -> bool:
         tracked = row["case"].startswith(TRACKING) and row["status"] == "converged" and "radii" in row["error_of"]
-        return tracked and FORCE.search(row["setting"]) is not None
+        timed = tracked and 0.0 < row["median_ms"] <= (row["p90_ms"] or math.inf)
+        return timed and FORCE.search(row["setting"]) is not None
 
     rows = _rows(path, like_a_task)
     if not any(row["case"] == CASE and row["method"] in RUNNABLE for row in rows):
-        raise ConfigError(
-            f"{path}: no {' or '.join(RUNNABLE)} converged in '{CASE}'; `trainer bench speed-error` measures it"
-        )
+        raise ConfigError(f"{path}: no {' or '.join(RUNNABLE)} converged in '{CASE}'; {_again(path)} measures it")
     return rows
 
 
@@ -204,7 +215,9 @@ def _for_vessel(vessel: VesselSpec, budget: SolverSpec, rows: list[dict[str, Any
             f"{budget.node_error_mm:g} with 'solver.force_error_mN' = {budget.force_error_mN:g}; the best is "
             f"{best.measured_solver_error_mm:.2g} mm with {best.tolerance_mN:.2g} mN ({best.method}: {source})"
         )
-    chosen, cheapest = (min(group, key=lambda m: m.measured_ms) for group in (able, enough))
+    chosen = _cheapest(able)
+    fastest = min(enough, key=lambda m: m.measured_ms)
+    cheapest = chosen if chosen.measured_ms <= fastest.measured_p90_ms else fastest
     errors, of = _model_error(vessel, path)
     timed = [(row["size"], row["median_ms"]) for row in rows if row["method"] == chosen.method]
     timed_nodes = _nearest({nearest, *(size for size, _ in timed)}, nodes)
@@ -224,6 +237,13 @@ def _for_vessel(vessel: VesselSpec, budget: SolverSpec, rows: list[dict[str, Any
 def _nearest(sizes: set[int], nodes: int) -> int:
     """The size of the nearest ratio to ``nodes``."""
     return min(sizes, key=lambda size: max(size / nodes, nodes / size))
+
+
+def _cheapest(measured: list[Measured]) -> Measured:
+    """The fastest; of those that are within its spread, the one with the largest tolerance."""
+    fastest = min(measured, key=lambda m: m.measured_ms)
+    alike = [m for m in measured if m.measured_ms <= fastest.measured_p90_ms]
+    return max(alike, key=lambda m: (m.tolerance_mN, -m.measured_ms))
 
 
 def _model_error(vessel: VesselSpec, path: Path) -> tuple[dict[str, float], str]:
@@ -251,6 +271,7 @@ def _measured(row: dict[str, Any], vessel: VesselSpec) -> Measured:
         setting=row["setting"],
         nodes=row["size"],
         measured_ms=row["median_ms"],
+        measured_p90_ms=row["median_ms"] if row["p90_ms"] is None else row["p90_ms"],
         measured_solver_error_mm=row["error"] * radius,
         tolerance_mN=float(found[1]) * unit_mN / (BENCH_MODULUS_KPA * BENCH_WALL_MM * BENCH_RADIUS_MM),
     )

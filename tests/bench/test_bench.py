@@ -5,16 +5,16 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
-from trainer.bench import page, realtime, vessel
+from trainer.bench import equilibria, page, realtime, vessel
 from trainer.bench.chart import chart
-from trainer.bench.rows import Row
+from trainer.bench.rows import Row, left_out, median_and_p90, plain, worst
 from trainer.bench.vessel import Work
 from trainer.clock import Realtime
 from trainer.mechanics.links import forces, hessian
@@ -41,7 +41,7 @@ def test_the_answers_are_in_equilibrium_and_stable_with_the_node_in_its_place(wo
     for place, x in zip(work.places, work.answers, strict=True):
         assert np.array_equal(x[work.node], place)
         assert np.array_equal(x[fixed], work.mesh.rest[fixed])
-        assert np.linalg.norm(forces(work.mesh, x)[work.free]) <= vessel.REFERENCE_mN
+        assert np.linalg.norm(forces(work.mesh, x)[work.free]) <= equilibria.REFERENCE_mN
         stiffness = hessian(work.mesh, x)[np.ix_(coordinates, coordinates)]
         assert np.linalg.eigvalsh(stiffness)[0] > 0.0
     way = np.linalg.norm(work.places[-1] - work.places[0])
@@ -96,15 +96,17 @@ def test_what_is_left_out_is_in_the_rows_with_its_reason() -> None:
 def rows() -> dict[str, list[Row]]:
     error_of = vessel.ERROR_OF
     timed = [
-        Row(case, size, method, f"to {error:g}", 14, ms, 2 * ms, error, error_of, 10 * error, "converged")
+        Row(
+            case, size, method, f"to {error:g}", 14, ms, 2 * ms, error, error_of, 10 * error, "converged", "share", 1e-4
+        )
         for case in ("tracking", "cold")
         for size in (312, 1984)
         for method, factor in (("relaxation", 100.0), ("kept factor", 1.0))
         for error, ms in ((1e-1, 0.5 * factor), (1e-5, 0.8 * factor))
     ]
-    left_out = Row("cold", 9999, "relaxation", "none", 0, 0.0, 0.0, 0.0, error_of, 0.0, "skipped: too slow")
-    limit = Row("cold", 312, "memory limit of all", "9 MB", 14, 0.1, 0.1, 0.0, error_of, 0.0, "bound")
-    return {"vessel": [*timed, left_out, limit]}
+    skipped = left_out("cold", 9999, "relaxation", "skipped: too slow", error_of, "share")
+    limit = Row("cold", 312, "memory limit of all", "9 MB", 14, 0.1, math.nan, math.nan, error_of, math.nan, "bound")
+    return {"vessel": [*timed, skipped, limit]}
 
 
 ABOUT = {
@@ -122,12 +124,13 @@ def test_the_report_holds_every_row_and_says_on_what_it_was_made(tmp_path: Path)
     written = page.write(folder, rows(), ABOUT, quick=True)
     assert [p.name for p in written] == ["speed_error.md", "speed_error.svg", "speed_error.json"]
     found = json.loads((folder / "speed_error.json").read_text())
-    assert found["rows"] == [{"subject": "vessel", **asdict(r)} for r in rows()["vessel"]]
+    assert found["rows"] == [{"subject": "vessel", **plain(r)} for r in rows()["vessel"]]
+    assert [found["rows"][-2][k] for k in ("median_ms", "p90_ms", "error", "residual")] == 4 * [None]
     assert found["machine"] == ABOUT
     words = (folder / "speed_error.md").read_text()
     table = [line for line in words.splitlines() if line.startswith(("| tracking |", "| cold |"))]
     assert len(table) == len(rows()["vessel"])
-    assert "| cold | 9999 | relaxation | none | 0 | | | |  | skipped: too slow |" in table
+    assert "| cold | 9999 | relaxation | none | 0 |  |  |  |  | skipped: too slow |" in table
     assert "--quick" in words
     assert "a <processor>, 2 cores, Linux x86_64; load 0.5 before and 1.5 after; numpy 2.4" in words
     drawn = ElementTree.fromstring((folder / "speed_error.svg").read_text())
@@ -145,13 +148,39 @@ def test_an_error_of_nothing_is_drawn_at_the_foot(tmp_path: Path) -> None:
 
 
 def test_methods_are_compared_at_the_same_error() -> None:
-    """Only settings within the bound count; where a method has none, its best error is told instead of a time."""
+    """Only settings within the bound of their case count; where a method has none, its best error is told instead of
+
+    a time. What answers nothing is not compared."""
     subject = page.SUBJECTS["vessel"]
     timed = rows()["vessel"]
-    assert page.comparison(timed, subject)[0] == "* tracking, 312 nodes: relaxation 80 ms; kept factor 0.8 ms."
-    coarse = [r for r in timed if r.method == "kept factor" or r.error > subject.compared_at]
+    assert page.comparison(timed, subject)[0] == (
+        "* tracking, 312 nodes, error at most 0.0001: relaxation 80 ms; kept factor 0.8 ms."
+    )
+    coarse = [r for r in timed if r.method == "kept factor" or r.error > 1e-4]
     assert "relaxation none (best error 1.0e-01 in 50 ms)" in page.comparison(coarse, subject)[0]
     assert "memory limit" not in "".join(page.comparison(timed, subject))
+    loose = [replace(r, compared_at=0.2) if r.case == "cold" and r.compared_at else r for r in timed]
+    assert page.comparison(loose, subject)[::2] == [
+        "* tracking, 312 nodes, error at most 0.0001: relaxation 80 ms; kept factor 0.8 ms.",
+        "* cold, 312 nodes, error at most 0.2: relaxation 50 ms; kept factor 0.5 ms.",
+    ]
+
+
+def test_few_frames_have_a_median_and_no_percentile() -> None:
+    """Between the fourth and the fifth of five the 90th percentile lies in 0.6 of the way."""
+    assert median_and_p90([3.0, 1.0, 2.0, 5.0, 4.0]) == (3.0, pytest.approx(4.6))
+    median, p90 = median_and_p90([3.0, 1.0, 2.0, 5.0])
+    assert (median, math.isnan(p90)) == (2.5, True)
+
+
+def test_what_is_not_finite_is_the_worst_and_null_in_json() -> None:
+    """An error that is no number would pass for none by ``max``."""
+    assert worst(worst(0.1, math.nan), 0.2) == math.inf
+    assert worst(0.1, 0.2) == 0.2
+    row = replace(rows()["vessel"][0], error=math.inf)
+    assert plain(row)["error"] is None
+    assert "| inf |" in page.markdown({"vessel": [row]}, ABOUT, quick=True)
+    assert ElementTree.fromstring(chart({"vessel": [row]}, {"vessel": "nodes"})).tag.endswith("svg")
 
 
 def performed(lengths: list[int], outcomes: list[str]) -> realtime.Perform:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
 
 import numpy as np
 import pytest
 
 from trainer.bench import hard_integrators, integrators
-from trainer.bench.rows import Row
+from trainer.bench.rows import Row, plain
 from trainer.mechanics.dynamics import Model, State
 from trainer.mechanics.integrators import RK4, Explicit
 
@@ -32,10 +31,10 @@ def test_every_method_swings_for_all_frames(rows: list[Row], work: integrators.W
     assert {row.method for row in rows} == set(hard_integrators.makers())
     for row in rows:
         assert (row.frames, row.size) == (len(work.answers), 64)
-        assert 0.0 < row.median_ms <= row.p90_ms
+        assert row.median_ms > 0.0
         assert 0.0 < row.error < 2.0
         assert row.status in {"stable", "converged", "one linear step"}
-    json.dumps([asdict(row) for row in rows], allow_nan=False)
+    json.dumps([plain(row) for row in rows], allow_nan=False)
 
 
 def test_errors_fall_as_the_orders_say(rows: list[Row]) -> None:

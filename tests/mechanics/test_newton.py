@@ -16,8 +16,8 @@ from allocations import ARRAY_HEADER, kept_bytes
 
 from trainer.geometry import Array
 from trainer.mechanics.krylov import NewtonKrylov
-from trainer.mechanics.links import LinkMesh, diagonal_blocks, energy, forces, hessian, link_mesh
-from trainer.mechanics.newton import Newton
+from trainer.mechanics.links import LinkMesh, blocks, diagonal_blocks, energy, forces, hessian, link_mesh
+from trainer.mechanics.newton import Newton, Pattern
 from trainer.mechanics.sweeps import BlockSweeps
 
 METHODS = [Newton, NewtonKrylov, BlockSweeps]
@@ -66,6 +66,21 @@ def test_all_methods_reach_the_same_stable_equilibrium(ratio: float) -> None:
     assert stiffness > 0.0
     for x in answers[1:]:
         assert np.max(np.linalg.norm(x - answers[0], axis=1)) <= 4.0 * tolerance / stiffness
+
+
+def test_the_sparse_stiffness_is_that_of_the_free_nodes() -> None:
+    """All entries are sums of at most 26 numbers of the size of a link's stiffness: 26 roundings."""
+    mesh = block(ratio=3.0)
+    rng = np.random.default_rng(0)
+    for moved in ([7], [40, 30], []):
+        free = free_of(mesh, np.array(moved, dtype=int))
+        chosen = np.isin(np.arange(len(mesh.rest)), free)
+        pattern = Pattern(mesh.links, chosen)
+        at = (3 * free[:, None] + np.arange(3)).ravel()
+        for shift in (0.0, 0.5):
+            x = mesh.rest + 0.1 * rng.normal(size=mesh.rest.shape)
+            dense = hessian(mesh, x)[np.ix_(at, at)] + shift * np.eye(len(at))
+            assert np.abs(pattern.fill(blocks(mesh, x), shift).toarray() - dense).max() < 26 * 3.0 * 2.0**-52
 
 
 @pytest.mark.parametrize("kind", [Newton, NewtonKrylov])

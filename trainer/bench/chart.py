@@ -34,7 +34,10 @@ DASHES = ("1 4", "4 3", "9 3", "none")
 def chart(rows: Mapping[str, Sequence[Row]], counts: Mapping[str, str]) -> str:
     """An SVG of all cases; ``counts``: what the sizes of a subject's rows count."""
     panels: list[list[str]] = []
-    drawn = {name: [r for r in of if r.frames and not r.method.startswith(LIMIT)] for name, of in rows.items()}
+    drawn = {
+        name: [r for r in of if r.frames and math.isfinite(r.error) and not r.method.startswith(LIMIT)]
+        for name, of in rows.items()
+    }
     for name, of_subject in drawn.items():
         for case in dict.fromkeys(r.case for r in of_subject):
             x0, y0 = len(panels) % 2 * WIDTH, len(panels) // 2 * HEIGHT

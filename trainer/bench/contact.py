@@ -7,6 +7,7 @@ The frames of all methods are run in turn.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from time import perf_counter_ns
@@ -15,7 +16,7 @@ import fcl
 import numpy as np
 from numba import njit
 
-from trainer.bench.rows import Row
+from trainer.bench.rows import Row, median_and_p90
 from trainer.geometry import Array
 from trainer.mechanics.bounding_spheres import SphereSearch, SphereTree
 from trainer.mechanics.cells import Cells
@@ -35,7 +36,9 @@ FRAMES, QUICK_FRAMES, FCL_FRAMES = 40, 12, 4
 #: Quick leaves out FCL from this number of triangles on: it builds for half a second a frame.
 QUICK_FCL_BELOW = 100_000
 ERROR_OF = "search: pairs missed or wrong, as a share of the pairs that looking at all of them finds"
-NO_ANSWER = "search: no pairs are asked for, so all are missed"
+NO_ANSWER = "search: none, no pairs are asked for"
+#: Methods are compared at this error: every pair and no other.
+COMPARED_AT = 0.0
 
 #: What a method does in a frame: the state's number to pairs, (k, 2), in any order.
 Search = Callable[[int], np.ndarray]
@@ -258,13 +261,14 @@ def compare(case: str, size: int, methods: list[Method], truth: list[set[tuple[i
             method.ms.append((perf_counter_ns() - begun) * 1e-6)
     rows = []
     for method in methods:
-        median, p90 = (float(v) for v in np.percentile(method.ms, (50, 90)))
-        off = error[id(method)]
+        median, p90 = median_and_p90(method.ms)
+        off = error[id(method)] if method.answers else math.nan
         status = ("all pairs" if off == 0.0 else "other pairs") if method.answers else "no pairs asked"
         rows.append(
             Row(
                 case, size, method.name, method.setting, len(method.ms), median, p90, off,
                 ERROR_OF if method.answers else NO_ANSWER, 0.0, status, "nothing",
+                COMPARED_AT if method.answers else None,
             )
         )  # fmt: skip
     return rows

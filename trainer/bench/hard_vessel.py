@@ -26,7 +26,8 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from trainer.bench.vessel import Work, prepare, residual_mN
+from trainer.bench.equilibria import residual_mN
+from trainer.bench.vessel import Work, prepare
 from trainer.geometry import Array
 from trainer.interactions.holding import HOLD, MOST_ITERATIONS, TOLERANCE_MN
 from trainer.mechanics.attachments import Anchors

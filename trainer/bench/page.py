@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import inspect
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from trainer.bench.chart import LIMIT, chart
+from trainer.bench.chart import chart
 from trainer.bench.machine import in_words
-from trainer.bench.rows import Row
+from trainer.bench.rows import Row, plain
 
 
 @dataclass(frozen=True)
@@ -21,17 +22,16 @@ class Subject:
 
     title: str
     counts: str  # what a row's size counts
-    compared_at: float  # the error at which the methods' times are compared, in the unit of the rows' error
 
 
 #: Each has ``measure(quick) -> list[Row]``.
 SUBJECTS = {
-    "vessel": Subject("A vessel's static equilibrium", "nodes", 1e-4),
-    "integrators": Subject("A swinging vessel", "nodes", 1e-2),
-    "thread": Subject("A thread", "links", 5e-3),
-    "contact": Subject("Contact search", "triangles or segments", 0.0),
-    "volume": Subject("Volumes of elements", "elements", 0.0),
-    "model": Subject("What the link mesh gets wrong of a solid", "nodes", 0.1),
+    "vessel": Subject("A vessel's static equilibrium", "nodes"),
+    "integrators": Subject("A swinging vessel", "nodes"),
+    "thread": Subject("A thread", "links"),
+    "contact": Subject("Contact search", "triangles or segments"),
+    "volume": Subject("Volumes of elements", "elements"),
+    "model": Subject("What the link mesh gets wrong of a solid", "nodes"),
 }
 
 Rows = Mapping[str, Sequence[Row]]
@@ -51,7 +51,7 @@ def document(rows: Rows, about: dict[str, Any], quick: bool) -> dict[str, Any]:
     return {
         "quick": quick,
         "machine": about,
-        "rows": [{"subject": name, **asdict(row)} for name, of_subject in rows.items() for row in of_subject],
+        "rows": [{"subject": name, **plain(row)} for name, of_subject in rows.items() for row in of_subject],
     }
 
 
@@ -95,7 +95,7 @@ def _section(name: str, rows: Sequence[Row]) -> list[str]:
         lines.append(f"* Residual: {what}.")
     lines += [
         "",
-        f"The fastest setting tried whose error is at most {subject.compared_at:g}:",
+        "The fastest setting tried of each method whose error is small enough:",
         "",
         *comparison(rows, subject),
         "",
@@ -103,30 +103,40 @@ def _section(name: str, rows: Sequence[Row]) -> list[str]:
         "|---|--:|---|---|--:|--:|--:|--:|--:|---|",
     ]
     for r in rows:
-        numbers = f"{ms(r.median_ms)} | {ms(r.p90_ms)} | {r.error:.1e} | {r.residual:.1e}" if r.frames else "| | | "
+        numbers = f"{ms(r.median_ms)} | {ms(r.p90_ms)} | {size_of(r.error)} | {size_of(r.residual)}"
         lines.append(f"| {r.case} | {r.size} | {r.method} | {r.setting} | {r.frames} | {numbers} | {r.status} |")
     return lines
 
 
 def ms(value: float) -> str:
-    """A time to three digits, without an exponent."""
+    """A time to three digits, without an exponent; nothing where none was measured."""
+    if math.isnan(value):
+        return ""
     return f"{value:.0f}" if value >= 100.0 else f"{value:.3g}"
 
 
+def size_of(value: float) -> str:
+    """An error or a residual to two digits; nothing where none was measured."""
+    return "" if math.isnan(value) else f"{value:.1e}"
+
+
 def comparison(rows: Sequence[Row], subject: Subject) -> list[str]:
-    """For each case and size the fastest setting of each method whose error is small enough, as a list."""
+    """For each case and size the fastest setting of each method whose error is small enough, as a list.
+
+    What is enough the case says; rows that answer nothing, as limits of the memory, are not compared.
+    """
     said = []
-    timed = [r for r in rows if r.frames and not r.method.startswith(LIMIT)]
-    for case, size in dict.fromkeys((r.case, r.size) for r in timed):
-        here = [r for r in timed if (r.case, r.size) == (case, size)]
+    timed = [(r, r.compared_at) for r in rows if r.frames and r.compared_at is not None]
+    for case, size, bound in dict.fromkeys((r.case, r.size, bound) for r, bound in timed):
+        here = [r for r, _ in timed if (r.case, r.size, r.compared_at) == (case, size, bound)]
         words = []
         for method in dict.fromkeys(r.method for r in here):
             tried = [r for r in here if r.method == method]
-            enough = [r.median_ms for r in tried if r.error <= subject.compared_at]
+            enough = [r.median_ms for r in tried if r.error <= bound]
             if enough:
                 words.append(f"{method} {ms(min(enough))} ms")
             else:
                 best = min(tried, key=lambda r: r.error)
-                words.append(f"{method} none (best error {best.error:.1e} in {ms(best.median_ms)} ms)")
-        said.append(f"* {case}, {size} {subject.counts}: {'; '.join(words)}.")
+                words.append(f"{method} none (best error {size_of(best.error)} in {ms(best.median_ms)} ms)")
+        said.append(f"* {case}, {size} {subject.counts}, error at most {bound:g}: {'; '.join(words)}.")
     return said

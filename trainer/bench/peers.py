@@ -63,7 +63,7 @@ class MuJoCo:
         self.data = mujoco.MjData(self.built)
         mujoco.mj_forward(self.built, self.data)
 
-    def frame(self, before: Array, after: Array) -> Array:
+    def frame(self, places: Array) -> Array:
         for _ in range(self.steps):
             self.engine.mj_step(self.built, self.data)
         self.engine.mj_kinematics(self.built, self.data)
@@ -105,7 +105,7 @@ class Elastica:
         self.steps = math.ceil(thread.FRAME_S / (ELASTICA_STEP * shortest))
         self.setting = f"EA {axial:g} N, radius {radius * 1e3:g} mm, {thread.FRAME_S / self.steps:.1e} s"
 
-    def frame(self, before: Array, after: Array) -> Array:
+    def frame(self, places: Array) -> Array:
         for _ in range(self.steps):
             self.time = self.stepper.step(self.simulator, self.time, np.float64(thread.FRAME_S / self.steps))
         return np.ascontiguousarray(self.rod.position_collection.T) * 1e3
@@ -137,7 +137,7 @@ def measure(links: int = 50, rounds: int = ROUNDS) -> list[Swings]:
     A swing before the first round compiles, and is not counted. The order turns by one from round to round.
     """
     model = thread.bare(links)
-    h = thread.reference_step(model, False)
+    h = thread.reference_step(model)
 
     def held() -> Holds:
         return holds(model, [0], [[0, 0, 0]])
@@ -151,7 +151,7 @@ def measure(links: int = 50, rounds: int = ROUNDS) -> list[Swings]:
     missing: list[Swings] = []
     for module in PEERS:
         try:
-            next(build for name, build in builders if name == module)().frame(np.zeros(3), np.zeros(3))
+            next(build for name, build in builders if name == module)().frame(np.zeros((2, 3)))
         except ImportError:
             said, nan = MISSING.format(module), float("nan")
             missing.append(Swings(Row(CASE, links, module, "-", 0, nan, nan, nan, said, nan, said), (), True))

@@ -145,7 +145,7 @@ def _print_rows(counts: str, rows: Sequence[Row]) -> None:
                 r.setting,
                 page.ms(r.median_ms),
                 page.ms(r.p90_ms),
-                f"{r.error:.1e}",
+                page.size_of(r.error),
                 r.status,
             )
             for r in rows

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from scipy.sparse import csc_matrix, eye_array
+from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import SuperLU, splu
 
 from trainer.geometry import Array
@@ -55,15 +55,33 @@ def factor(matrix: csc_matrix) -> SuperLU | None:
     return lu if np.array_equal(lu.perm_r, lu.perm_c) and np.all(lu.U.diagonal() > 0.0) else None
 
 
+class Pattern:
+    """Where the links' blocks go in the sparse stiffness of the nodes ``free`` (n,) bool: found once, filled often."""
+
+    def __init__(self, links: np.ndarray, free: np.ndarray) -> None:
+        number = np.where(free, np.cumsum(free) - 1, -1)
+        i, j = number[links].T
+        row, column = np.concatenate([i, j, i, j]), np.concatenate([i, j, j, i])
+        both = (row >= 0) & (column >= 0)
+        self.free, self._size = free.copy(), 3 * int(np.count_nonzero(free))
+        self._kept = np.broadcast_to(both[:, None, None], (len(both), 3, 3))
+        at = (3 * column[:, None, None] + np.arange(3)) * self._size + 3 * row[:, None, None] + np.arange(3)[:, None]
+        place, self._into = np.unique(at[self._kept], return_inverse=True)
+        self._row = (place % self._size).astype(np.int32)
+        self._begin = np.searchsorted(place, np.arange(self._size + 1) * self._size).astype(np.int32)
+        self._diagonal = np.flatnonzero(place // self._size == self._row)
+
+    def fill(self, block: Array, shift: float = 0.0) -> csc_matrix:
+        """The stiffness mN/mm of the links' blocks (m, 3, 3), and ``shift`` on its diagonal."""
+        values = np.concatenate([block, block, -block, -block])[self._kept]
+        data = np.bincount(self._into, values, minlength=len(self._row)).astype(np.float64, copy=False)
+        data[self._diagonal] += shift
+        return csc_matrix((data, self._row, self._begin), shape=(self._size, self._size))
+
+
 def sparse_matrix(mesh: LinkMesh, block: Array) -> csc_matrix:
     """The stiffness (3 n, 3 n) mN/mm of the links' blocks (m, 3, 3), fixed nodes included."""
-    i, j = mesh.links.T.astype(np.int64)
-    row = 3 * np.concatenate([i, j, i, j])[:, None, None] + np.arange(3)[:, None]
-    column = 3 * np.concatenate([i, j, j, i])[:, None, None] + np.arange(3)
-    row, column = np.broadcast_arrays(row, column)
-    values = np.concatenate([block, block, -block, -block])
-    size = 3 * len(mesh.rest)
-    return csc_matrix((values.ravel(), (row.ravel(), column.ravel())), shape=(size, size))
+    return Pattern(mesh.links, np.ones(len(mesh.rest), dtype=bool)).fill(block)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -90,6 +108,7 @@ class Newton:
         self.branch = never_stretched(mesh)  # where on their law the links are; ``links.settle`` moves it
         self._longest = float(np.median(mesh.rest_length))
         self._block = np.zeros((len(mesh.links), 3, 3))
+        self._pattern: Pattern | None = None
         self._trial, self._step, self._way = (mesh.rest.copy() for _ in range(3))
         self._force, self._trial_force = np.zeros_like(mesh.rest), np.zeros_like(mesh.rest)
 
@@ -163,13 +182,13 @@ class Newton:
     def _solve(self, force: Array, free: np.ndarray, shift: float) -> bool:
         """The step that ``_block`` and a ``shift``, mN/mm, on its diagonal answer to ``force`` with, into ``_step``;
         False if they are not positive definite."""
-        at = np.flatnonzero(free)
-        dof = (3 * at[:, None] + np.arange(3)).ravel()
-        lu = factor(sparse_matrix(self.mesh, self._block)[dof][:, dof] + shift * eye_array(len(dof), format="csc"))
+        if self._pattern is None or not np.array_equal(free, self._pattern.free):
+            self._pattern = Pattern(self.mesh.links, free)
+        lu = factor(self._pattern.fill(self._block, shift))
         if lu is None:
             return False
         self._step[:] = 0.0
-        self._step[at] = lu.solve(force[at].ravel()).reshape(-1, 3)
+        self._step[free] = lu.solve(force[free].ravel()).reshape(-1, 3)
         return True
 
     def _search(self, free: np.ndarray, load: Array, energy: float) -> float | None:
