@@ -198,6 +198,29 @@ def test_a_file_that_is_no_report_is_refused_in_one_line(report: Path, text: str
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"median_ms": "fast"}, {"median_ms": float("nan")}, {"error": -1.0}, {"error": float("inf")}, {"size": 0},
+        {"size": "many"}, {"size": True}, {"p90_ms": []}, {"setting": None},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_a_row_that_nobody_can_have_measured_is_refused_in_one_line(report: Path, wrong: dict[str, object]) -> None:
+    with pytest.raises(ConfigError, match=r"speed_error\.json: not a report; .* writes one"):
+        chosen(report, [*KEPT, KEPT[0] | wrong])
+
+
+@pytest.mark.parametrize("unknown", ["median_ms", "error"])
+def test_a_row_that_was_not_measured_is_not_chosen(report: Path, unknown: str) -> None:
+    assert chosen(report, [*KEPT, row("kept factor", "to 1 mN", 1e-3, 1e-9) | {unknown: None}]) == chosen(report, KEPT)
+
+
+def test_a_report_that_is_missing_is_told_with_what_writes_it(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"speed_error\.json: no such report; `trainer bench speed-error --out"):
+        choose_tissue(STITCH, "t.toml", tmp_path / "speed_error.json")
+
+
 def test_the_rows_are_those_of_the_vessel_that_is_assumed() -> None:
     """Where the bench changes its vessel, so must the numbers by which its rows are carried over."""
     work = prepare(5, 8, both_ends=False, frames=1)

@@ -170,10 +170,27 @@ def region_method(anatomy: AnatomySpec | None) -> dict[str, Any] | None:
 
 def _rows(path: Path, wanted: Callable[[dict[str, Any]], bool]) -> list[dict[str, Any]]:
     """The rows of a report that are ``wanted``. Raises ConfigError."""
+    if not path.exists():
+        raise ConfigError(f"{path}: no such report; {_again(path)} writes one")
     try:
-        return [row for row in json.loads(config.read_text(path))["rows"] if wanted(row)]
-    except (json.JSONDecodeError, KeyError, TypeError):
-        raise ConfigError(f"{path}: not a report; {_again(path)} writes one") from None
+        rows = json.loads(config.read_text(path))["rows"]
+        if all(map(_is_row, rows)):
+            return [row for row in rows if wanted(row)]
+    except (json.JSONDecodeError, KeyError, TypeError, RecursionError):
+        pass
+    raise ConfigError(f"{path}: not a report; {_again(path)} writes one")
+
+
+def _is_row(row: dict[str, Any]) -> bool:
+    """Whether a row has what a choice reads, as the bench writes it. Raises KeyError and TypeError where it has not."""
+    words = all(isinstance(row[key], str) for key in ("case", "method", "setting", "status", "error_of"))
+    measured = (row[key] for key in ("median_ms", "p90_ms", "error"))
+    return words and type(row["size"]) is int and row["size"] > 0 and all(map(_is_measured, measured))
+
+
+def _is_measured(value: Any) -> bool:
+    """A number that can have been measured, or none."""
+    return value is None or (type(value) in (int, float) and 0.0 <= value < math.inf)
 
 
 def _again(path: Path) -> str:
@@ -186,7 +203,7 @@ def _tissue_rows(path: Path) -> list[dict[str, Any]]:
 
     def like_a_task(row: dict[str, Any]) -> bool:
         tracked = row["case"].startswith(TRACKING) and row["status"] == "converged" and "radii" in row["error_of"]
-        timed = tracked and 0.0 < row["median_ms"] <= (row["p90_ms"] or math.inf)
+        timed = tracked and row["error"] is not None and 0.0 < (row["median_ms"] or 0.0) <= (row["p90_ms"] or math.inf)
         return timed and FORCE.search(row["setting"]) is not None
 
     rows = _rows(path, like_a_task)

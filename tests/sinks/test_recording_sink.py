@@ -243,6 +243,14 @@ def test_a_path_that_cannot_be_written_is_one_clear_line(tmp_path: Path, name: s
     assert "\n" not in str(caught.value)
 
 
+def test_the_recording_of_a_session_that_began_at_the_same_time_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "x.rrd"
+    path.write_bytes(b"of another")
+    with pytest.raises(RecordingError, match="File exists"):
+        RecordingSink(path, header(), layout(), HZ)
+    assert path.read_bytes() == b"of another"
+
+
 FULL_DISK = """
 import resource, sys
 from pathlib import Path

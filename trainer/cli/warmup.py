@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 def warmup() -> None:
     """Compile all kernels, by running each task once in memory; later sessions start at once."""
+    from dataclasses import replace
     from time import perf_counter
 
     from trainer.curriculum import family_names, load_family, load_task
@@ -23,7 +24,10 @@ def warmup() -> None:
     begun = perf_counter()
     for family in family_names():
         for name in load_family(family).tasks:
-            warm_up(load_task(f"{family}/{name}").task)
+            task = load_task(f"{family}/{name}").task
+            warm_up(task)
+            if task.scene.thread is not None and not task.scene.thread.drapes:  # a teacher's copy of it may
+                warm_up(replace(task, scene=replace(task.scene, thread=replace(task.scene.thread, drapes=True))))
     typer.echo(f"kernels are ready after {perf_counter() - begun:.1f} s, kept in {os.environ['NUMBA_CACHE_DIR']}")
 
 

@@ -208,7 +208,7 @@ class RecordingSink:
         self._ticks_per_frame = max(1, math.ceil(tick_hz / max_hz - 1e-9))
         self._next_frame = 0
         try:
-            open(self.path, "wb").close()
+            open(self.path, "xb").close()  # not that of a session that began at the same time
         except OSError as error:
             raise RecordingError(self.path, error) from None
         self._recorder = recorder or RecorderProcess()
