@@ -87,12 +87,7 @@ def two_in_one_triangle() -> str:
     first = replace(task.step[0], clock_deg=4.0, bite_mm=0.33)
     again = replace(first, name="again", clock_deg=5.0, bite_mm=0.34)
     task = replace(task, step=(first, again))
-    s = scene.build(task)
-    hands, events = ScriptedHands(Hand(), task, s.home, 0), list[Event]()
-    while not s.outcome:
-        seen = hands.poll(s.tick, s.view())
-        assert seen is not None, f"the hand stopped: {hands.summary()['stopped']}"
-        events += step(s, seen)
+    s, events = _performed(task)
     made = [(e.wall, e.pass_number) for e in events if isinstance(e, Pierce)]
     assert made == [("outer", 1), ("inner", 1), ("outer", 2), ("inner", 2)], f"holes {made}"
     holes = [h for h in s.world.open_holes() if h.place.wall == "outer"]
@@ -182,16 +177,22 @@ def grazing(name: str) -> str:
     return f"ok: {_kinds(events)}; up to {most:.2g} mN"
 
 
-def _drive(tick_hz: float) -> Pierce:
-    """One drive by a hand without fault: both hulls, once each."""
-    task = task_of("needle-drive")
-    task = replace(task, step=task.step[:1], tick_hz=tick_hz)
+def _performed(task: Task) -> tuple[Scene, list[Event]]:
+    """The scene when a hand without fault has performed a task, and what happened."""
     s = scene.build(task)
     hands, events = ScriptedHands(Hand(), task, s.home, 0), list[Event]()
     while not s.outcome:
         seen = hands.poll(s.tick, s.view())
         assert seen is not None, f"the hand stopped: {hands.summary()['stopped']}"
         events += step(s, seen)
+    return s, events
+
+
+def _drive(tick_hz: float) -> Pierce:
+    """One drive by a hand without fault: both hulls, once each."""
+    task = task_of("needle-drive")
+    task = replace(task, step=task.step[:1], tick_hz=tick_hz)
+    s, events = _performed(task)
     made = [(e.wall, e.direction) for e in events if isinstance(e, Pierce)]
     assert s.outcome == "completed", f"the drive ended: {s.outcome}"
     assert made == [("outer", "in"), ("inner", "in")], f"holes {made}"
